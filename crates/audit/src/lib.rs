@@ -162,8 +162,7 @@ impl KnownEntries {
 /// The first fact of the training that the entry states otherwise.
 fn difference(meta: &EntryMeta, found: &TrainingFacts) -> Option<(&'static str, String, String)> {
     let expected = training_facts(meta);
-    // a number that went through JSON twice may differ in its last bit
-    let minutes = (expected.minutes - found.minutes).abs() <= 1e-9 * expected.minutes.abs();
+    let minutes = expected.is_as_long(found);
     let text = |value: &Option<String>| value.clone().unwrap_or_else(|| "none".to_owned());
     let data_set = meta.data_set_of(&expected, found).to_owned();
     let facts = [

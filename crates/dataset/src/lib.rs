@@ -35,8 +35,9 @@ pub use lerobot::{
     ACTION, ActionKind, ActionProvenance, CameraFile, Check, Column, ConvertOptions, ConvertReport, Dataset, DepthMaps,
     DepthUnit, ENTITY_PREFIX, ENVIRONMENT_STATE, EnvMeta, EpisodeMeta, ExportReport, Feature, Features, ImageForm,
     Info, MISTAKE, OldSet, PictureFile, PictureStore, Pictures, Provenance, RotationForm, STATE, Shard, ShardReport,
-    SkippedDemo, TIME_TOLERANCE, VideoEncoder, VideoOptions, VideoProvenance, convert, convert_shard, convert_unless,
-    edit, export, merge_shards, notes, rewrite, shard_files, source_hash, verify, verify_source, verify_within,
+    SkippedDemo, TIME_TOLERANCE, Texts, VideoEncoder, VideoOptions, VideoProvenance, convert, convert_shard,
+    convert_unless, edit, export, merge_shards, notes, rewrite, shard_files, source_hash, verify, verify_source,
+    verify_within,
 };
 pub use plan::{DemoPlan, Dialect, Join, KeyPlan, Place, Plan, Problem};
 pub use puzzle_table::{PuzzleSet, write_puzzles};

@@ -17,6 +17,15 @@ mod tests {
         let signature = Signature { observation, action_dim: 7, ..Signature::default() };
         let wide = serde_json::json!({"dim_model": 128, "n_heads": 4, "dim_feedforward": 256, "action_horizon": 16});
         let deep = serde_json::json!({"dim_model": 32, "n_heads": 4, "dim_feedforward": 64, "action_horizon": 100});
+        let long = |keys: serde_json::Value| {
+            let mut all =
+                serde_json::json!({"dim_model": 128, "n_heads": 4, "dim_feedforward": 256, "action_horizon": 900});
+            all.as_object_mut().unwrap().extend(keys.as_object().unwrap().clone());
+            all
+        };
+        let (vae, plain_long) = (long(serde_json::json!({})), long(serde_json::json!({"use_vae": false})));
+        let over = ["memory", "tokens"].map(|over| long(serde_json::json!({"reasoning": {"over": over}})));
+        let untied = long(serde_json::json!({"use_vae": false, "reasoning": {"untied": true}}));
         let layers = serde_json::json!({"hidden": [1024, 1024], "action_horizon": 16});
         let plain = serde_json::json!({});
         let levels = serde_json::json!({"network": {"down_dims": [32, 64, 128]}});
@@ -26,7 +35,8 @@ mod tests {
         let shallow = serde_json::json!({"dim_model": 64, "n_layers": 2});
         for kind in PolicyConfig::TYPES {
             let tried = match *kind {
-                "act" | "actrm" => vec![&wide, &deep],
+                "act" => vec![&wide, &deep, &vae, &plain_long],
+                "actrm" => [&wide, &deep, &vae, &plain_long, &untied].into_iter().chain(&over).collect(),
                 "bc" => vec![&layers],
                 "bc_rnn" => vec![&recurrent],
                 "bc_transformer" => vec![&shallow],
@@ -37,10 +47,23 @@ mod tests {
             for keys in tried {
                 let config = config(kind, keys.clone());
                 let told = config.size().weights;
-                let real = config.build(&signature, 1, &nn::Backend::CPU).unwrap().params().count() as f64;
+                let model = config.build(&signature, 1, &nn::Backend::CPU).unwrap();
+                let real = model.params().count() as f64;
+                config.check_size(&model.params().tensors()).unwrap();
                 assert!(0.5 * real <= told && told <= real, "{kind} {keys}: {told} of {real}");
             }
         }
+    }
+
+    #[test]
+    fn options_of_a_far_larger_model_are_refused() {
+        let signature = Signature::low_dimensional(9, 10, 7);
+        let keys = serde_json::json!({"dim_model": 32, "n_heads": 4, "dim_feedforward": 64, "action_horizon": 8});
+        let model = config("act", keys.clone()).build(&signature, 1, &nn::Backend::CPU).unwrap();
+        let mut larger = keys;
+        larger["dim_feedforward"] = 1_000_000_u64.into();
+        let error = config("act", larger).check_size(&model.params().tensors()).unwrap_err().to_string();
+        assert!(error.contains("numbers") && error.contains("as the options say"), "{error}");
     }
 
     #[test]

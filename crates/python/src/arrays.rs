@@ -5,7 +5,7 @@
 
 use bytemuck::Pod;
 use pyo3::buffer::PyBuffer;
-use pyo3::exceptions::PyRuntimeError;
+use pyo3::exceptions::{PyMemoryError, PyRuntimeError};
 use pyo3::intern;
 use pyo3::prelude::*;
 use pyo3::sync::GILOnceCell;
@@ -68,6 +68,17 @@ pub(crate) fn array<'py, T: Number>(py: Python<'py>, shape: &[usize], values: &[
     filled(py, shape, |out| out.copy_from_slice(values))
 }
 
+/// So many zeros; an exception where there is no memory for them.
+pub(crate) fn zeros<T: Pod>(count: usize) -> PyResult<Vec<T>> {
+    let mut values = Vec::new();
+    if values.try_reserve_exact(count).is_err() {
+        let text = format!("no memory for {count} numbers of {} bytes", size_of::<T>());
+        return Err(PyMemoryError::new_err(text));
+    }
+    values.resize(count, T::zeroed());
+    Ok(values)
+}
+
 fn made<'py, T: Pod>(
     py: Python<'py>,
     shape: &[usize],
@@ -80,7 +91,7 @@ fn made<'py, T: Pod>(
             fill(values);
         } else {
             // no allocator of Python's gives memory that is aligned so badly
-            let mut values = vec![T::zeroed(); count];
+            let mut values = zeros(count)?;
             fill(&mut values);
             bytes.copy_from_slice(bytemuck::cast_slice(&values));
         }

@@ -13,7 +13,7 @@ use pyo3::types::{PyDict, PyTuple};
 use rayon::{ThreadPool, ThreadPoolBuilder};
 use rustix::process::{Pid, getpid};
 
-use crate::arrays::{Number, filled, flags};
+use crate::arrays::{Number, filled, flags, zeros};
 use crate::dataset::PyDataset;
 use crate::error::{Error, defect};
 use crate::work::{LOOK, released};
@@ -36,8 +36,8 @@ pub(crate) trait Columns {
     /// An array of this shape, whose values `fill` writes, row-major.
     fn add<T: Number>(&mut self, name: &str, shape: &[usize], kind: Kind, fill: impl FnOnce(&mut [T])) -> PyResult<()>;
 
-    /// Texts, or one of them by itself.
-    fn texts(&mut self, name: &str, texts: Vec<&str>, alone: bool) -> PyResult<()>;
+    /// Texts, or one of them by itself; Python's None where there is none.
+    fn texts(&mut self, name: &str, texts: Vec<Option<&str>>, alone: bool) -> PyResult<()>;
 }
 
 /// At once into arrays of a dict.
@@ -59,7 +59,7 @@ impl Columns for Arrays<'_, '_> {
         self.0.set_item(name, made.call_method1("transpose", PyTuple::new(py, order.collect::<Vec<_>>())?)?)
     }
 
-    fn texts(&mut self, name: &str, texts: Vec<&str>, alone: bool) -> PyResult<()> {
+    fn texts(&mut self, name: &str, texts: Vec<Option<&str>>, alone: bool) -> PyResult<()> {
         match (alone, texts.as_slice()) {
             (true, [text]) => self.0.set_item(name, text),
             _ => self.0.set_item(name, texts),
@@ -77,15 +77,16 @@ struct Ahead(Vec<Part>);
 impl Columns for Ahead {
     fn add<T: Number>(&mut self, name: &str, shape: &[usize], kind: Kind, fill: impl FnOnce(&mut [T])) -> PyResult<()> {
         let (name, shape) = (name.to_owned(), shape.to_owned());
-        let mut values = vec![T::zeroed(); shape.iter().product()];
+        let mut values = zeros(shape.iter().product())?;
         fill(&mut values);
         self.0.push(Box::new(move |arrays| arrays.add(&name, &shape, kind, |out| out.copy_from_slice(&values))));
         Ok(())
     }
 
-    fn texts(&mut self, name: &str, texts: Vec<&str>, alone: bool) -> PyResult<()> {
-        let (name, texts) = (name.to_owned(), texts.into_iter().map(str::to_owned).collect::<Vec<_>>());
-        self.0.push(Box::new(move |arrays| arrays.texts(&name, texts.iter().map(String::as_str).collect(), alone)));
+    fn texts(&mut self, name: &str, texts: Vec<Option<&str>>, alone: bool) -> PyResult<()> {
+        let (name, texts) =
+            (name.to_owned(), texts.into_iter().map(|text| text.map(str::to_owned)).collect::<Vec<_>>());
+        self.0.push(Box::new(move |arrays| arrays.texts(&name, texts.iter().map(Option::as_deref).collect(), alone)));
         Ok(())
     }
 }
@@ -222,7 +223,13 @@ impl Batches {
             let waiting = &mut made;
             match released(py, move || waiting.recv_timeout(LOOK)).0 {
                 Ok(parts) => break parts?,
-                Err(RecvTimeoutError::Timeout) => py.check_signals()?,
+                Err(RecvTimeoutError::Timeout) => {
+                    if let Err(error) = py.check_signals() {
+                        // the next call waits for this batch again
+                        self.coming.lock().unwrap_or_else(PoisonError::into_inner).ahead.push_front(made);
+                        return Err(error);
+                    }
+                }
                 Err(RecvTimeoutError::Disconnected) => return Err(Error::new_err("a thread that makes batches ended")),
             }
         };

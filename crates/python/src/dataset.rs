@@ -10,28 +10,29 @@ use pyo3::types::{PyDict, PyList, PyTuple};
 
 use crate::arrays::array;
 use crate::batches::{Arrays, Batches, Columns, Kind, Order};
-use crate::error::{natural, raised};
+use crate::error::{natural, raised, words};
 use crate::work::{run, unlocked};
 
 /// The most samples in a batch.
 const MOST_SAMPLES: usize = 1 << 24;
 
 /// The largest whole number up to which float32 holds each, in which columns are kept in memory.
-const MOST_WHOLE: f64 = 16_777_216.0;
+const MOST_WHOLE: f32 = 16_777_216.0;
 
 /// A LeRobotDataset v3.0 folder, written by actrm or by LeRobot, as a map-style data set.
 ///
 /// Sample `i` is the `i`-th frame of the chosen episodes: a dict with LeRobot's keys and shapes. A numeric column is an
 /// array (a scalar without an axis), a camera (3, height, width), depth (1, height, width). Numbers are float32,
-/// booleans bool, texts str and whole numbers int64 (beyond 2^24 rounded to float32; `notes` says so). All columns stay
-/// in memory.
+/// booleans bool, texts str (None where a frame has none) and whole numbers int64 (beyond 2^24 rounded to float32;
+/// `notes` says so). All columns stay in memory.
 ///
 /// Parameters
 /// ----------
 /// path: the folder.
 /// delta_timestamps: for each column the offsets of the frames in a sample. Integers count frames; if any is a float,
 ///     all are seconds, as in LeRobot. The column then has a leading axis of frames, and `<column>_is_pad` marks the
-///     frames outside the episode, which repeat its first or last frame.
+///     frames outside the episode, which repeat its first or last frame. A camera with one offset has that axis too;
+///     LeRobot leaves it out where the camera is stored as video.
 /// split: only the episodes of this mask (`train`, `valid`, ...).
 /// episodes: only these episodes, instead of `split`.
 /// cameras: cameras to read; all unless given.
@@ -49,17 +50,18 @@ pub(crate) struct PyDataset {
     samples: Samples,
     tasks: Tasks,
     /// Of each frame of the whole set, by column.
-    texts: BTreeMap<String, Vec<String>>,
+    texts: BTreeMap<String, dataset::Texts>,
+    notes: Vec<String>,
 }
 
 /// Where a frame's task stands.
 enum Tasks {
     /// Nowhere.
     None,
-    /// The index of each episode's only task.
-    OfEpisodes(Vec<usize>),
     /// The index of each frame's.
     OfFrames(Vec<usize>),
+    /// The index of each episode's only task, where frames state none.
+    OfEpisodes(Vec<usize>),
 }
 
 /// What it was made with.
@@ -107,11 +109,14 @@ impl PyDataset {
         let depth = depth.unwrap_or_else(|| dataset.depth_names().map(str::to_owned).collect());
         let spec = SampleSpec { offsets, cameras, depth, depth_unit, episodes: chosen.clone() };
         let samples = unlocked(py, || run(|| dataset.samples(&spec)).map_err(raised))?;
-        let tasks = unlocked(py, || run(|| tasks_of(&dataset)).map_err(raised))?;
         let texts = unlocked(py, || run(|| dataset.texts()).map_err(raised))?;
+        let (tasks, notes) = unlocked(py, || {
+            let (tasks, untold) = tasks_of(&dataset);
+            Ok((tasks, dataset.notes().iter().cloned().chain(untold).chain(notes(&dataset, &samples)).collect()))
+        })?;
         let SampleSpec { offsets, cameras, depth, .. } = spec;
         let given = Given { path, offsets, cameras, depth, depth_unit, return_uint8 };
-        Ok(Self { given, dataset, chosen, samples, tasks, texts })
+        Ok(Self { given, dataset, chosen, samples, tasks, texts, notes })
     }
 
     fn __len__(&self) -> usize {
@@ -171,6 +176,9 @@ impl PyDataset {
         if last.is_none() {
             return Err(PyValueError::new_err("start and steps: more samples than there are numbers"));
         }
+        if len == 0 && steps.is_some_and(|steps| steps > 0) {
+            return Err(PyValueError::new_err("steps: expected samples to make batches of, found none"));
+        }
         let order = match (seed, steps) {
             (Some(seed), Some(steps)) if len > 0 => Order::training(seed, batch_size, start..start + steps),
             (None, Some(_)) => return Err(PyValueError::new_err("steps: expected a seed with them, found none")),
@@ -180,7 +188,7 @@ impl PyDataset {
     }
 
     /// Stored statistics over all episodes, of depth in its output unit: for each column `min`, `max`, `mean`,
-    /// `std`, quantiles and `count`.
+    /// `std`, quantiles and `count`, as far as they are stored.
     #[getter]
     fn stats<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let all = PyDict::new(py);
@@ -201,7 +209,7 @@ impl PyDataset {
             let factor = self.given.depth_unit.factor(feature.and_then(Feature::depth_unit));
             // one number a channel, which fits images with their channels first
             let axes = if feature.is_some_and(Feature::is_visual) { &[1, 1][..] } else { &[] };
-            for (statistic, values) in lists {
+            for (statistic, values) in lists.into_iter().filter(|(_, values)| !values.is_empty()) {
                 let values: Vec<f64> = values.iter().map(|value| value * factor).collect();
                 of.set_item(statistic, array(py, &[&[values.len()], axes].concat(), &values)?)?;
             }
@@ -261,17 +269,8 @@ impl PyDataset {
     /// Faults of the data set that were read as LeRobot reads them, columns whose whole numbers are rounded, and columns
     /// that samples lack.
     #[getter]
-    fn notes(&self) -> Vec<String> {
-        let whole = self.samples.numbers().filter(|column| column.kind == NumberKind::Whole);
-        let rounded = whole.filter_map(|SampleColumn { name, .. }| {
-            let stats = self.dataset.stats().get(name)?;
-            let most = stats.min.iter().chain(&stats.max).map(|value| value.abs()).fold(0.0, f64::max);
-            (most > MOST_WHOLE).then(|| format!("{name}: whole numbers beyond {MOST_WHOLE} are rounded to float32"))
-        });
-        let features = &self.dataset.info().features.0;
-        let language = features.iter().filter(|(_, feature)| feature.dtype == "language");
-        let language = language.map(|(name, _)| format!("{name}: samples have no language"));
-        self.dataset.notes().iter().cloned().chain(rounded).chain(language).collect()
+    fn notes(&self) -> &[String] {
+        &self.notes
     }
 
     /// Names of the masks that `split` takes.
@@ -358,22 +357,15 @@ impl PyDataset {
     pub(crate) fn columns(&self, samples: &[u32], batch: Option<usize>, out: &mut impl Columns) -> PyResult<()> {
         for (i, column) in self.samples.numbers().enumerate() {
             let shape = self.shape(batch, column);
-            let copied = |len| {
-                let mut values = vec![0.0; len];
-                self.samples.copy_numbers(i, samples, &mut values);
-                values
-            };
             match column.kind {
                 NumberKind::Real => out.add(&column.name, &shape, Kind::Numbers, |out| {
                     self.samples.copy_numbers(i, samples, out);
                 })?,
                 NumberKind::Whole => out.add(&column.name, &shape, Kind::Numbers, |out: &mut [i64]| {
-                    let values = copied(out.len());
-                    out.iter_mut().zip(values).for_each(|(out, value)| *out = value as i64);
+                    self.converted(i, column.width(), samples, out, |value| value as i64);
                 })?,
                 NumberKind::Truth => out.add(&column.name, &shape, Kind::Flags, |out: &mut [u8]| {
-                    let values = copied(out.len());
-                    out.iter_mut().zip(values).for_each(|(out, value)| *out = u8::from(value != 0.0));
+                    self.converted(i, column.width(), samples, out, |value| u8::from(value != 0.0));
                 })?,
             }
             self.padding(samples, batch, column, out)?;
@@ -391,7 +383,7 @@ impl PyDataset {
             self.padding(samples, batch, column, out)?;
         }
         for (name, texts) in &self.texts {
-            let chosen = samples.iter().map(|&sample| texts[self.samples.place(sample).index].as_str());
+            let chosen = samples.iter().map(|&sample| texts.get(self.samples.place(sample).index));
             out.texts(name, chosen.collect(), batch.is_none())?;
         }
         self.places(samples, batch, out)
@@ -403,6 +395,15 @@ impl PyDataset {
         // LeRobot's columns of one number have no axis
         let row = if column.shape == [1] { &[][..] } else { &column.shape };
         batch.into_iter().chain(rows).chain(row.iter().copied()).collect()
+    }
+
+    /// Numbers of another type than they have in memory.
+    fn converted<T>(&self, column: usize, each: usize, samples: &[u32], out: &mut [T], to: impl Fn(f32) -> T) {
+        let mut values = vec![0.0; each];
+        for (sample, out) in samples.iter().zip(out.chunks_exact_mut(each.max(1))) {
+            self.samples.copy_numbers(column, &[*sample], &mut values);
+            out.iter_mut().zip(&values).for_each(|(out, &value)| *out = to(value));
+        }
     }
 
     /// Pictures from 0 to 1, as PyTorch scales them.
@@ -454,7 +455,7 @@ impl PyDataset {
             return Ok(());
         }
         set("task_index", &task)?;
-        let texts = places.iter().map(|place| self.dataset.tasks()[task(place)].as_str());
+        let texts = places.iter().map(|place| self.dataset.tasks().get(task(place)).map(String::as_str));
         out.texts("task", texts.collect(), batch.is_none())
     }
 }
@@ -478,14 +479,31 @@ fn offsets(dataset: &dataset::Dataset, given: &Bound<'_, PyAny>) -> PyResult<BTr
     Ok(all)
 }
 
-/// The tasks of episodes, or of frames where an episode has several.
-fn tasks_of(dataset: &dataset::Dataset) -> Result<Tasks, dataset::DatasetError> {
+/// The tasks that frames state, as LeRobot reads them, else those of episodes that have one; and why there are none.
+fn tasks_of(dataset: &dataset::Dataset) -> (Tasks, Option<String>) {
     let index = |episode: &dataset::EpisodeMeta| match episode.tasks.as_slice() {
         [task] => dataset.tasks().iter().position(|text| text == task),
         _ => None,
     };
-    match dataset.episodes().iter().map(index).collect() {
-        Some(tasks) => Ok(Tasks::OfEpisodes(tasks)),
-        None => Ok(dataset.frame_tasks()?.map_or(Tasks::None, Tasks::OfFrames)),
+    match dataset.frame_tasks() {
+        Ok(Some(tasks)) => (Tasks::OfFrames(tasks), None),
+        Ok(None) => {
+            let tasks: Option<_> = dataset.episodes().iter().map(index).collect();
+            (tasks.map_or(Tasks::None, Tasks::OfEpisodes), None)
+        }
+        Err(error) => (Tasks::None, Some(format!("samples have no task: {}", words(&error)))),
     }
+}
+
+/// Columns whose whole numbers are rounded, and columns that samples lack.
+fn notes(dataset: &dataset::Dataset, samples: &Samples) -> Vec<String> {
+    let large = |column: &&SampleColumn| {
+        let values = dataset.column(&column.name).map_or(&[][..], |column| column.data);
+        column.kind == NumberKind::Whole && values.iter().any(|value| value.abs() >= MOST_WHOLE)
+    };
+    let rounded = samples.numbers().filter(large);
+    let rounded = rounded.map(|c| format!("{}: whole numbers beyond {MOST_WHOLE} are rounded to float32", c.name));
+    let features = &dataset.info().features.0;
+    let language = features.iter().filter(|(_, feature)| feature.dtype == "language");
+    rounded.chain(language.map(|(name, _)| format!("{name}: samples have no language"))).collect()
 }

@@ -3,7 +3,7 @@
 use std::any::Any;
 
 use pyo3::create_exception;
-use pyo3::exceptions::{PyException, PyValueError};
+use pyo3::exceptions::{PyException, PyOverflowError, PyRuntimeWarning, PyTypeError, PyValueError};
 use pyo3::prelude::*;
 
 create_exception!(
@@ -11,6 +11,14 @@ create_exception!(
     Error,
     PyException,
     "An error of actrm, with the message of its programs: file, key, what was expected and what was found."
+);
+
+create_exception!(
+    actrm,
+    ResultsTakenOver,
+    PyRuntimeWarning,
+    "A warning: episodes of an earlier call are among the results of a policy of yours. It comes every time, unless a \
+     filter of yours says otherwise."
 );
 
 /// An error with everything behind it, in one line.
@@ -43,8 +51,14 @@ pub(crate) fn natural<T: TryFrom<i128>>(name: &str, value: i128) -> PyResult<T> 
     })
 }
 
-/// An error of Python's about `what`, which it does not name.
+/// An error of Python's about `what`, which it does not name: that it is not a value as it should be.
 pub(crate) fn named(py: Python<'_>, what: &str, error: PyErr) -> PyErr {
+    let of_value = error.is_instance_of::<PyTypeError>(py)
+        || error.is_instance_of::<PyValueError>(py)
+        || error.is_instance_of::<PyOverflowError>(py);
+    if !of_value {
+        return error;
+    }
     let named = PyValueError::new_err(format!("{what}: {}", error.value(py)));
     named.set_cause(py, Some(error));
     named

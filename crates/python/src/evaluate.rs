@@ -6,6 +6,7 @@ use std::sync::atomic::Ordering;
 use std::sync::{Arc, PoisonError};
 
 use models::{ModelError, Policy};
+use pyo3::PyTypeInfo;
 use pyo3::exceptions::{PyRuntimeWarning, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
@@ -20,7 +21,7 @@ use zoo::results::{Execution, Seeds, StoredEvaluation};
 use zoo::{FeatureKeys, ZooError};
 
 use crate::arrays::{array, flags};
-use crate::error::{Error, natural, raised, words};
+use crate::error::{Error, ResultsTakenOver, natural, raised, words};
 use crate::external::{Failure, Given, PythonPolicy};
 use crate::policy::{registry, stated};
 use crate::work::interruptible;
@@ -29,6 +30,9 @@ use crate::work::interruptible;
 enum News {
     At(u64, u64),
     Note(String),
+    TakenOver(String),
+    /// A note on episodes that are done.
+    Late(String),
 }
 
 /// How it ended.
@@ -211,10 +215,11 @@ pub(crate) fn evaluate<'py>(
             spec.control = control;
             let options = EvaluationOptions { seeds, shard: None, env_module: environment.env_module.clone(), force };
             let note = |text: String| drop(news.send(News::Note(text)));
+            let taken_over = |text: String| drop(news.send(News::TakenOver(text)));
             if let Some(ready) = remembered_greeting(&spec) {
                 let subject = subject_of(&ready)?;
                 if let Some(stored) = finished(&subject, &ready, &results, &options)? {
-                    asked.taken_over(&subject, stored.episodes.len() as u64).into_iter().for_each(note);
+                    asked.taken_over(&subject, stored.episodes.len() as u64).into_iter().for_each(taken_over);
                     return Ok(End::Complete(Box::new(stored)));
                 }
             }
@@ -231,7 +236,7 @@ pub(crate) fn evaluate<'py>(
                         return;
                     }
                     Progress::Begin { done, total, .. } => {
-                        asked.taken_over(&subject, done).into_iter().for_each(note);
+                        asked.taken_over(&subject, done).into_iter().for_each(taken_over);
                         (done, total)
                     }
                     Progress::Episode(_) => (at.0 + 1, at.1),
@@ -240,7 +245,7 @@ pub(crate) fn evaluate<'py>(
             });
             let incidents = pool.incidents().len();
             if incidents > 0 {
-                note(format!("{incidents} worker failures; the episodes were run again"));
+                drop(news.send(News::Late(format!("{incidents} worker failures; the episodes were run again"))));
             }
             pool.close();
             Ok(match end? {
@@ -254,9 +259,14 @@ pub(crate) fn evaluate<'py>(
         },
         |news| match news {
             News::At(done, total) => tell.call1((done, total)).map(drop),
-            News::Note(text) => {
-                let text = std::ffi::CString::new(text.replace('\0', "\u{fffd}"))?;
-                PyErr::warn(py, &py.get_type::<PyRuntimeWarning>(), &text, 1)
+            News::Note(text) => warn::<PyRuntimeWarning>(py, &text),
+            News::TakenOver(text) => warn::<ResultsTakenOver>(py, &text),
+            News::Late(text) => {
+                // where warnings are errors, it takes no results away
+                if let Err(error) = warn::<PyRuntimeWarning>(py, &text) {
+                    error.write_unraisable(py, None);
+                }
+                Ok(())
             }
         },
     )?;
@@ -271,6 +281,12 @@ pub(crate) fn evaluate<'py>(
         End::Stopped => Err(Error::new_err("the evaluation was stopped")),
         End::Failed(text) => Err(Error::new_err(text)),
     }
+}
+
+/// Warns whoever called the package's own `evaluate`.
+fn warn<T: PyTypeInfo>(py: Python<'_>, text: &str) -> PyResult<()> {
+    let text = std::ffi::CString::new(text.replace('\0', "\u{fffd}"))?;
+    PyErr::warn(py, &py.get_type::<T>(), &text, 2)
 }
 
 /// The features that these keys make.

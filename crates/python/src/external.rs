@@ -13,7 +13,7 @@ use crate::work::locked;
 /// Names and lists of keys, or other texts.
 type Named<T> = BTreeMap<String, T>;
 
-/// A policy, name of its entry, its source, SHA-256 of its class's text, what its owner declares, keys of its features,
+/// A policy, name of its entry, its source, SHA-256 of its code, what its owner declares, keys of its features,
 /// side of its images, conventions.
 pub(crate) type Given =
     (Py<PyAny>, String, String, Option<String>, Option<String>, Option<Named<Vec<String>>>, i128, Named<String>);

@@ -40,10 +40,10 @@ fn panics(py: Python<'_>) -> PyResult<()> {
 #[pymodule]
 fn _actrm(module: &Bound<'_, PyModule>) -> PyResult<()> {
     work::at_home();
-    let ending = wrap_pyfunction!(work::ending, module)?;
-    module.py().import("atexit")?.call_method1("register", (ending,))?;
+    module.py().import("atexit")?.call_method1("register", (work::Ending::default(),))?;
     module.add("__version__", env!("CARGO_PKG_VERSION"))?;
     module.add("Error", module.py().get_type::<error::Error>())?;
+    module.add("ResultsTakenOver", module.py().get_type::<error::ResultsTakenOver>())?;
     module.add_class::<dataset::PyDataset>()?;
     module.add_class::<batches::Batches>()?;
     module.add_class::<policy::PyPolicy>()?;

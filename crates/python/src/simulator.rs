@@ -12,6 +12,7 @@ use rollout::{
     Control, FaultKind, Initial, Pool, PoolOptions, Ready, Stepped, Worker, WorkerFault, WorkerSpec, find_python,
     harness_folder,
 };
+use rustix::process::{Pid, getpid};
 use zoo::evaluation::Environment;
 use zoo::external::usual_inputs;
 use zoo::{FeatureKeys, Past};
@@ -28,6 +29,8 @@ pub(crate) struct Simulator {
     keys: FeatureKeys,
     pool: Mutex<Option<Pool>>,
     past: Mutex<Past>,
+    /// The process that its worker is of.
+    home: Pid,
 }
 
 #[pymethods]
@@ -78,7 +81,8 @@ impl Simulator {
             Ok((keys, pool))
         };
         let (keys, pool) = interruptible(py, |_, _| start(), |()| Ok(()))??;
-        Ok(Self { ready: pool.ready().clone(), keys, pool: Mutex::new(Some(pool)), past: Mutex::default() })
+        let ready = pool.ready().clone();
+        Ok(Self { ready, keys, pool: Mutex::new(Some(pool)), past: Mutex::default(), home: getpid() })
     }
 
     /// Begins the episode of `seed`: the observation, and what is known of the episode.
@@ -130,7 +134,9 @@ impl Simulator {
     /// Ends the worker.
     fn close(&self, py: Python<'_>) -> PyResult<()> {
         unlocked(py, || {
-            if let Some(pool) = self.lock().take() {
+            if getpid() == self.home
+                && let Some(pool) = self.lock().take()
+            {
                 pool.close();
             }
             Ok(())
@@ -201,6 +207,12 @@ impl Simulator {
 
     /// Asks the worker; one that failed is gone, one that says what is wrong with the request stays.
     fn worker<T>(&self, ask: impl FnOnce(&mut Worker) -> Result<T, WorkerFault>) -> PyResult<T> {
+        if getpid() != self.home {
+            // another thread may have held the lock when this process was forked, and is not here to give it back
+            let task = &self.ready.task;
+            let text = format!("the simulator of task {task} is another process's, from which this one was forked");
+            return Err(Error::new_err(text));
+        }
         let mut held = self.lock();
         let Some(worker) = held.as_mut().and_then(Pool::first_worker) else {
             return Err(Error::new_err(format!("the simulator of task {} was closed", self.ready.task)));
@@ -241,6 +253,15 @@ impl Simulator {
             all.set_item(name, values)?;
         }
         Ok(all)
+    }
+}
+
+impl Drop for Simulator {
+    fn drop(&mut self) {
+        if getpid() != self.home {
+            // a thread that is not here may have been at it
+            std::mem::forget(self.pool.get_mut().unwrap_or_else(PoisonError::into_inner).take());
+        }
     }
 }
 

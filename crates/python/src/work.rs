@@ -119,9 +119,32 @@ impl Drop for Inside {
     }
 }
 
-/// What Python calls when it begins to end: lets no other thread back in, and waits for those that are.
-#[pyfunction]
-pub(crate) fn ending(py: Python<'_>) {
+/// An exit handler that acts once Python lets go of it: Python does so only after it has called all handlers, of which
+/// some wait for threads that use this package. It calls them newest first, so that ours is not the last one.
+#[pyclass(frozen)]
+#[derive(Default)]
+pub(crate) struct Ending {
+    /// Handlers are also let go of without a call, in forks that are to forget them.
+    called: AtomicBool,
+}
+
+#[pymethods]
+impl Ending {
+    fn __call__(&self) {
+        self.called.store(true, Ordering::SeqCst);
+    }
+}
+
+impl Drop for Ending {
+    fn drop(&mut self) {
+        if self.called.load(Ordering::SeqCst) {
+            Python::with_gil(ending);
+        }
+    }
+}
+
+/// Lets no other thread back in, and waits for those that are.
+fn ending(py: Python<'_>) {
     let first = ENDING.set(std::thread::current().id()).is_ok();
     // what others counted before a fork is nobody's here
     if first && HOME.get() == Some(&getpid()) {

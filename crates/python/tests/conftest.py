@@ -24,9 +24,10 @@ os.environ.setdefault("ACTRM_PYTHON", str(ROOT / ".venv/bin/python"))
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-def output(*command: str | Path, given: bytes = b"") -> bytes:
+def output(*command: str | Path, given: bytes = b"", env: dict[str, str] | None = None) -> bytes:
     """What a program writes."""
-    return subprocess.run([str(word) for word in command], input=given, check=True, capture_output=True).stdout
+    words = [str(word) for word in command]
+    return subprocess.run(words, input=given, check=True, capture_output=True, env=env).stdout
 
 
 @pytest.fixture(scope="session")

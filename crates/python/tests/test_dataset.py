@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import pickle
+import shutil
+import signal
 from pathlib import Path
 
 import actrm
@@ -59,6 +62,24 @@ def test_columns_have_the_types_that_lerobot_wrote() -> None:
     ]
 
 
+def test_frames_without_a_text_large_numbers_and_tasks_within_an_episode(tmp_path: Path) -> None:
+    """Of a set without statistics, whose episodes each name one task, and whose frames state another."""
+    odd = Path(__file__).parent / "fixtures/lerobot_odd"
+    ds = actrm.Dataset(odd)
+    assert [ds[i]["note"] for i in (0, 1)] == ["step 0 of 0", None]
+    for batch in (ds.batch([0, 1]), next(ds.batches(2)), next(ds.batches(2, threads=1))):
+        assert batch["note"] == ["step 0 of 0", None] and batch["task"] == ["write", "erase"]
+    assert ds.notes == ["count: whole numbers beyond 16777216 are rounded to float32"]
+    # no frame's task is in the table
+    bare = tmp_path / "bare"
+    shutil.copytree(odd, bare)
+    (bare / "meta/tasks.parquet").unlink()
+    info = json.loads((bare / "meta/info.json").read_text())
+    (bare / "meta/info.json").write_text(json.dumps({**info, "total_tasks": 0}))
+    ds = actrm.Dataset(bare)
+    assert "task" not in ds[0] and "samples have no task: " in " ".join(ds.notes)
+
+
 def test_rows_follow_each_other_and_end_with_the_episode(lift: Path) -> None:
     ds = actrm.Dataset(lift, delta_timestamps={"action": range(4)})
     plain = actrm.Dataset(lift)
@@ -103,6 +124,17 @@ def test_statistics_are_numpy_s(lift: Path) -> None:
     assert stats["count"].tolist() == [len(ds)]
 
 
+def test_statistics_that_are_not_stored_are_absent(tmp_path: Path) -> None:
+    shutil.copytree(FIXTURES / "lerobot_texts", tmp_path / "set")
+    path = tmp_path / "set/meta/stats.json"
+    kept = {
+        name: {key: value for key, value in of.items() if not key.startswith("q")}
+        for name, of in json.loads(path.read_text()).items()
+    }
+    path.write_text(json.dumps(kept))
+    assert sorted(actrm.Dataset(tmp_path / "set").stats["action"]) == ["count", "max", "mean", "min", "std"]
+
+
 def test_batches_are_what_training_reads(lift: Path) -> None:
     """Bit for bit, over the end of an epoch, in training's order."""
     horizon, size, seed, steps = 16, 64, 5, 40
@@ -134,6 +166,34 @@ def test_threads_make_the_same_batches_ahead(lift: Path, threads: int) -> None:
     assert len(next(ds.batches(64, seed=1, threads=threads))["action"]) == 64
     with pytest.raises(ValueError, match="^threads: expected 0 to 256, found 257$"):
         ds.batches(64, threads=257)
+
+
+@pytest.mark.parametrize("threads", [0, 1])
+def test_a_batch_without_memory_for_it_is_an_exception(threads: int) -> None:
+    ds = actrm.Dataset(FIXTURES / "lerobot_texts", {"action": range(100_000)})
+    with pytest.raises(MemoryError):
+        next(ds.batches(1 << 24, seed=1, steps=1, threads=threads))
+
+
+def test_a_signal_takes_no_batch_away() -> None:
+    class Enough(Exception):
+        pass
+
+    def enough(*_: object) -> None:
+        raise Enough
+
+    ds = actrm.Dataset(FIXTURES / "lerobot_texts", {"action": range(100_000)})
+    before = signal.signal(signal.SIGALRM, enough)
+    try:
+        batches = ds.batches(300, seed=1, steps=3, threads=1)
+        signal.setitimer(signal.ITIMER_REAL, 0.02)
+        with pytest.raises(Enough):
+            next(batches)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+    wanted = [batch["index"].tolist() for batch in actrm.Dataset(ds.root).batches(300, seed=1, steps=3)]
+    assert [batch["index"].tolist() for batch in batches] == wanted
 
 
 def test_batches_end_with_the_epoch(lift: Path) -> None:
@@ -214,6 +274,8 @@ def test_what_cannot_be_asked_for_is_an_exception(lift: Path) -> None:
             ds.batches(size)
     with pytest.raises(ValueError, match="steps"):
         ds.batches(4, steps=3)
+    with pytest.raises(ValueError, match="steps: expected samples to make batches of, found none"):
+        actrm.Dataset(lift, episodes=[]).batches(4, seed=1, steps=3)
     with pytest.raises(ValueError, match="more samples"):
         ds.batches(1 << 20, seed=1, steps=1, start=1 << 60)
     for arguments, words in (
@@ -232,8 +294,6 @@ def test_what_cannot_be_asked_for_is_an_exception(lift: Path) -> None:
 
 
 def test_a_damaged_data_set_is_an_exception(lift: Path, tmp_path: Path) -> None:
-    import shutil
-
     bad = tmp_path / "bad"
     shutil.copytree(lift, bad)
     for path in sorted(bad.rglob("*.parquet")) + [bad / "meta/info.json"]:

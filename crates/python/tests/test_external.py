@@ -5,6 +5,8 @@ from __future__ import annotations
 import copy
 import importlib
 import json
+import os
+import subprocess
 import sys
 import textwrap
 import warnings
@@ -14,7 +16,8 @@ from typing import Any
 import actrm
 import numpy as np
 import pytest
-from conftest import ROOT
+from actrm._policies import code  # pyright: ignore[reportPrivateUsage]
+from conftest import ROOT, output
 
 LIFT_ACT = ROOT / "zoo/lift-act"
 
@@ -150,8 +153,76 @@ def test_another_policy_under_one_name_is_not_taken_for_it(tmp_path: Path, monke
         "2 of the episodes are those of an earlier call, of entry mine@1: another policy needs another name=, and "
         "other weights need another declared="
     ]
-    with pytest.warns(RuntimeWarning, match="^2 of the episodes are those of an earlier call, of entry mine@1"):
+    with pytest.warns(actrm.ResultsTakenOver, match="^2 of the episodes are those of an earlier call, of entry mine@1"):
         actrm.evaluate(module.Policy(), episodes=3, **options)
+
+
+def test_results_that_are_taken_over_are_said_every_time(tmp_path: Path) -> None:
+    """At the line of the caller's."""
+    script = """
+import sys
+import actrm
+slide = {"task": "Slide", "env_module": "toy_simulator", "inputs": {"observation.state": ["place"]}}
+for turn in range(4):
+    actrm.evaluate(lambda _: [-1.0], name="own", episodes=2, workers=1, zoo=sys.argv[1], progress=False, **slide)
+"""
+    (tmp_path / "own.py").write_text(script)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT / "tools/harness/tests")}
+    said = subprocess.run(
+        [sys.executable, str(tmp_path / "own.py"), str(tmp_path)], capture_output=True, text=True, env=environment
+    )
+    assert said.returncode == 0 and said.stderr.count("own.py:6: ResultsTakenOver: 2 of the episodes") == 3
+
+
+CLASS = """
+import dataclasses
+import functools
+
+class Base:
+    gain = {gain}
+    @staticmethod
+    def limit(x):
+        return x {limit} 2
+    @property
+    def half(self):
+        return self.gain / {half}
+
+@dataclasses.dataclass
+class Policy(Base):
+    weight: float = 1.0
+    def select_action(self, observation):
+        kinds = observation["kind"] in {{"a", "b", "c", {kind!r}}}
+        return [self.limit(kinds)] * 7
+
+part = functools.partial(lambda k, seen: k {limit} 1, {half})
+"""
+
+
+def test_the_code_that_runs_tells_versions_apart(tmp_path: Path) -> None:
+    """Not the file, which may have been edited since, or be a notebook; the same in every process."""
+
+    def made(**other: Any) -> dict[str, Any]:
+        names: dict[str, Any] = {"__name__": "own"}
+        text = CLASS.format(**{"gain": 1, "limit": "+", "half": 2, "kind": "d", **other})
+        lines = "\n" * other.get("lines", 0)
+        exec(compile(lines + text, "nowhere.py", "exec", dont_inherit=True), names)
+        return names
+
+    usual = made()
+    known = code(usual["Policy"]())
+    assert known == code(made(lines=3)["Policy"]()) and code(usual["part"]) == code(made(gain=3)["part"])
+    others = [{"gain": 2}, {"limit": "-"}, {"half": 3}, {"kind": "e"}]
+    assert len({known, *(code(made(**other)["Policy"]()) for other in others)}) == 5
+    assert len({code(made(**other)["part"]) for other in others}) == 3
+    for _ in range(100):
+        # Python rewrites code that has run often
+        usual["Policy"]().select_action({"kind": "a"})
+    assert code(usual["Policy"]()) == known and code(usual["Policy"]().select_action) not in (known, None)
+    assert code(len) is code(actrm.load_policy(LIFT_ACT)) is None
+    (tmp_path / "own.py").write_text(CLASS.format(gain=1, limit="+", half=2, kind="d"))
+    script = "import own; from actrm._policies import code; print(code(own.Policy()))"
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path), "PYTHONHASHSEED": "7"}
+    assert output(sys.executable, "-c", script, env=environment).decode().strip() == known
 
 
 class Chunks:

@@ -228,6 +228,14 @@ def test_what_does_not_fit_is_named(zoo: Path) -> None:
                 ask(asked)
     with pytest.raises(ValueError, match="observation.state: could not convert"):
         policy.select_action({**good, "observation.state": ["a"] * 9})
+    for error in (KeyboardInterrupt, MemoryError):
+
+        class Raising:
+            def __array__(self, *_: object, error: type = error) -> np.ndarray:
+                raise error
+
+        with pytest.raises(error):
+            policy.select_action({**good, "observation.state": Raising()})
     broken = np.stack([state, state])
     broken[1, 4] = np.nan
     with pytest.raises(ValueError, match=r"observation.state\[1, 4\] is NaN, expected a finite number"):

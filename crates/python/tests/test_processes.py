@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -12,6 +13,10 @@ from pathlib import Path
 import actrm
 import numpy as np
 import pytest
+from conftest import ROOT
+
+# with a simulator that needs none
+TOY = {**os.environ, "PYTHONPATH": str(ROOT / "tools/harness/tests")}
 
 
 def asked(policy: actrm.Policy) -> dict[str, np.ndarray]:
@@ -176,6 +181,69 @@ time.sleep(0.1)
         command = [sys.executable, "-c", script, str(zoo / "lift-act"), str(lift), str(tmp_path / f"{turn}")]
         said = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
         assert (said.returncode, said.stderr) == (0, "")
+
+
+def test_exit_handlers_wait_for_threads_and_evaluate(zoo: Path, tmp_path: Path) -> None:
+    """Those too that were there before the package was imported, which Python calls last."""
+    script = """
+import atexit, sys, threading
+stop, begun = threading.Event(), threading.Event()
+def close():
+    stop.set()
+    thread.join()
+    slide = {"task": "Slide", "env_module": "toy_simulator", "inputs": {"observation.state": ["place"]}}
+    own = {"name": "own", "episodes": 1, "workers": 1, "zoo": sys.argv[2], "progress": False}
+    print(actrm.evaluate(lambda _: [-1.0], **slide, **own)["success"])
+atexit.register(close)
+import actrm, numpy as np
+policy = actrm.load_policy(sys.argv[1])
+seen = {key: np.zeros(shape, np.float32) for key, shape in policy.input_features.items()}
+def work():
+    while not stop.is_set():
+        policy.select_action(seen)
+        begun.set()
+thread = threading.Thread(target=work, daemon=True)
+thread.start()
+begun.wait()
+"""
+    command = [sys.executable, "-c", script, str(zoo / "lift-act"), str(tmp_path)]
+    said = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False, env=TOY)
+    assert (said.returncode, said.stdout, said.stderr) == (0, "[ True]\n", "")
+
+
+def test_a_simulator_in_use_elsewhere_is_refused_in_a_fork() -> None:
+    script = """
+import os, signal, sys, threading, time
+import actrm, numpy as np
+simulator = actrm.Simulator("Slide", keys={"observation.state": ["place"]}, env_module="toy_simulator")
+simulator.reset(1)
+going = True
+def step():
+    while going:
+        simulator.step(np.zeros(1, np.float32))
+thread = threading.Thread(target=step)
+thread.start()
+codes = []
+for turn in range(10):
+    time.sleep(0.02)
+    child = os.fork()
+    if child == 0:
+        signal.alarm(5)
+        try:
+            simulator.reset(2)
+        except actrm.Error as error:
+            simulator.close()
+            del simulator
+            os._exit(0 if "forked" in str(error) else 1)
+    codes.append(os.waitpid(child, 0)[1])
+going = False
+thread.join()
+simulator.close()
+print(codes)
+"""
+    command = [sys.executable, "-W", "ignore", "-c", script]
+    said = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False, env=TOY)
+    assert (said.returncode, said.stdout, said.stderr) == (0, f"{[0] * 10}\n", "")
 
 
 @pytest.mark.skipif(not find_spec("torch"), reason="torch is not installed here")

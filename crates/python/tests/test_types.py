@@ -47,7 +47,7 @@ def test_functions_take_what_is_stated(name: str) -> None:
     assert stated(FUNCTIONS[name]) == found(getattr(_actrm, name))
 
 
-@pytest.mark.parametrize("name", sorted(CLASSES.keys() - {"Error"}))
+@pytest.mark.parametrize("name", sorted(CLASSES.keys() - {"Error", "ResultsTakenOver"}))
 def test_classes_have_what_is_stated(name: str) -> None:
     thing = getattr(_actrm, name)
     members = {node.name: node for node in CLASSES[name].body if isinstance(node, ast.FunctionDef)}

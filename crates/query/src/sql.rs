@@ -170,15 +170,20 @@ fn frames(dataset: &Dataset) -> Result<DataFrame, PolarsError> {
         column("task", task),
     ];
     let mut taken: BTreeSet<String> = columns.iter().map(|c| c.name().to_string()).collect();
-    for (name, feature) in &dataset.info().features.0 {
-        let Some(values) = dataset.column(name).filter(|_| !taken.contains(name)) else { continue };
+    let own = |name: &str, dim: usize, d: usize| match dim {
+        1 => plain(name),
+        _ => format!("{}_{d}", plain(name)),
+    };
+    let known = || dataset.info().features.0.iter().filter_map(|(name, f)| Some((name, f, dataset.column(name)?)));
+    // no number of one feature takes the name of another
+    let reserved: BTreeSet<String> =
+        known().flat_map(|(name, _, values)| (0..values.dim).map(move |d| own(name, values.dim, d))).collect();
+    for (name, feature, values) in known() {
         for d in 0..values.dim {
             let given = feature.names.get(d).and_then(Value::as_str).map(plain);
-            let own = match values.dim {
-                1 => plain(name),
-                _ => format!("{}_{d}", plain(name)),
-            };
-            let unique = named(given.filter(|n| values.dim > 1 && !taken.contains(n)).unwrap_or(own), &mut taken);
+            let free = |given: &String| values.dim > 1 && !taken.contains(given) && !reserved.contains(given);
+            let unique = given.filter(free).unwrap_or_else(|| own(name, values.dim, d));
+            let unique = named(unique, &mut taken);
             let data: Vec<f32> = values.data.iter().skip(d).step_by(values.dim).copied().collect();
             columns.push(match feature.dtype.as_str() {
                 "bool" => column(&unique, data.iter().map(|&v| v != 0.0).collect::<Vec<bool>>()),

@@ -38,6 +38,30 @@ fn sums_counts_and_joins_agree_with_the_columns() {
 }
 
 #[test]
+fn no_number_takes_the_name_of_a_feature() {
+    let dir = tempfile::tempdir().unwrap();
+    drop(set(dir.path()));
+    let path = dir.path().join("set/meta/info.json");
+    std::fs::remove_dir_all(dir.path().join("set/actrm")).unwrap();
+    let mut info: serde_json::Value = serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
+    info["features"]["observation.state"]["names"][1] = json!("next_reward");
+    info["features"]["observation.state"]["names"][2] = json!("action_0");
+    std::fs::write(&path, info.to_string()).unwrap();
+    let set = Dataset::open(&dir.path().join("set")).unwrap();
+    let sum =
+        |column: &str| query::query(&set, &format!("SELECT SUM({column}) FROM frames")).unwrap().rows[0][0].as_f64();
+    let expected = |name: &str, d: usize| {
+        let column = set.column(name).unwrap();
+        column.data.iter().skip(d).step_by(column.dim).sum::<f32>()
+    };
+    for (column, name, d) in
+        [("next_reward", "next.reward", 0), ("action_0", "action", 0), ("observation_state_1", "observation.state", 1)]
+    {
+        assert!((sum(column).unwrap() - f64::from(expected(name, d))).abs() < 1e-3, "{column}");
+    }
+}
+
+#[test]
 fn a_wrong_query_names_what_is_wrong() {
     let dir = tempfile::tempdir().unwrap();
     let set = set(dir.path());

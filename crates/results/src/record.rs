@@ -142,6 +142,13 @@ pub struct TrainingFacts {
     pub demos: u64,
 }
 
+impl TrainingFacts {
+    /// Whether both took as long: older programs read numbers from JSON to all but the last bit.
+    pub fn is_as_long(&self, other: &Self) -> bool {
+        (self.minutes - other.minutes).abs() <= 1e-9 * self.minutes.abs()
+    }
+}
+
 /// A row of seeds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -274,8 +281,16 @@ impl EvaluationRecord {
         let unknown = self.sources.is_empty() || other.sources.is_empty();
         let as_released = || self.changed_sources().is_empty() && other.changed_sources().is_empty();
         let sources = self.sources == other.sources || (unknown && as_released());
-        let rest = |of: &Self| Self { kernels: None, renderer: None, sources: BTreeMap::new(), ..of.clone() };
-        sources && told(|of| of.kernels.as_ref()) && told(|of| of.renderer.as_ref()) && rest(self) == rest(other)
+        let rest = |of: &Self| {
+            let training = TrainingFacts { minutes: 0.0, ..of.training.clone() };
+            Self { kernels: None, renderer: None, sources: BTreeMap::new(), training, ..of.clone() }
+        };
+        let minutes = self.training.is_as_long(&other.training);
+        sources
+            && minutes
+            && told(|of| of.kernels.as_ref())
+            && told(|of| of.renderer.as_ref())
+            && rest(self) == rest(other)
     }
 
     /// Whether episodes of both may stand in one row: one evaluation, and the same sources or none known of either.

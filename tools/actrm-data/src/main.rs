@@ -3,6 +3,7 @@
 
 mod cameras;
 mod commands;
+mod parents;
 mod svg;
 mod view;
 

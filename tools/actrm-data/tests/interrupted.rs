@@ -25,6 +25,17 @@ fn names(folder: &Path) -> Vec<String> {
 }
 
 #[test]
+fn folders_made_for_nothing_go_again() {
+    let dir = tempfile::tempdir().unwrap();
+    for out in ["nn/a/b", "nn/a/b.hdf5"] {
+        assert!(!convert(&dir.path().join("missing.hdf5"), &dir.path().join(out)).status().unwrap().success());
+        assert!(names(dir.path()).is_empty());
+    }
+    assert!(convert(&fixture(), &dir.path().join("nn/a/b")).status().unwrap().success());
+    assert_eq!(names(&dir.path().join("nn/a")), ["b"]);
+}
+
+#[test]
 fn killed_at_fifty_moments_it_leaves_all_or_nothing() {
     let dir = tempfile::tempdir().unwrap();
     let (source, out) = (dir.path().join("in.hdf5"), dir.path().join("set"));

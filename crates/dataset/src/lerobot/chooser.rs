@@ -1,7 +1,7 @@
 //! Chooses the columns of the demos of a source, and notes what is taken for granted or left out.
 
 use super::depth::{self, DepthKind};
-use super::encoded::may_hold_files;
+use super::encoded::{Files, may_hold_files};
 use super::features::{Column, ConvertOptions, IndexColumn, MISTAKE, Mapping, Origin};
 use super::info::{ActionKind, ActionProvenance, Feature, RotationForm};
 use super::to_robomimic::{Stated, stated};
@@ -57,8 +57,7 @@ pub(super) struct Chooser<'a> {
     pub plan: &'a Plan,
     /// What the others are compared with.
     pub first: &'a DemoPlan,
-    /// Datasets of JPEG files, with height and width of their pictures.
-    pub files: &'a BTreeMap<String, (usize, usize)>,
+    pub files: &'a Files,
     /// So many demos that have a dataset make it one that all should have.
     pub least: usize,
 }
@@ -245,13 +244,13 @@ impl Chooser<'_> {
         let mut taken = BTreeSet::new();
         let mut cameras: BTreeMap<&str, &KeyPlan> = BTreeMap::new();
         for (path, key) in std::iter::once(self.first).chain(&self.plan.demos).flat_map(|demo| &demo.keys) {
-            if self.files.contains_key(path) || key.is_image() {
+            if self.files.sizes.contains_key(path) || key.is_image() {
                 cameras.entry(path).or_insert(key);
             }
         }
         for (path, key) in cameras.into_iter().filter(|(path, _)| self.usual(path)) {
             let Some(name) = path.strip_prefix("obs/") else { continue };
-            let (jpeg, (height, width)) = match (self.files.get(path), key.is_image()) {
+            let (jpeg, (height, width)) = match (self.files.sizes.get(path), key.is_image()) {
                 (Some(&size), _) => (true, size),
                 (None, true) if key.shape[3] == 3 => (false, (key.shape[1], key.shape[2])),
                 _ => continue,
@@ -340,7 +339,7 @@ impl Chooser<'_> {
             let shape = key.shape.get(1..).unwrap_or_default();
             let is_column = |c: &Column| matches!(&c.origin, Origin::Depth { key, .. } if key == path);
             let reason = match (shape, &key.dtype) {
-                _ if !path.starts_with("obs/") || self.files.contains_key(path) => continue,
+                _ if !path.starts_with("obs/") || self.files.sizes.contains_key(path) => continue,
                 _ if columns.iter().any(is_column) || numbers.contains(path) => continue,
                 ([_, _, 3], _) if key.is_image() => continue,
                 ([_, _, 1], Dtype::U8) => "LeRobot records no grey images, and its ACT takes three channels",
@@ -356,7 +355,7 @@ impl Chooser<'_> {
                 ([], Dtype::VarBytes) => NO_COLOUR,
                 _ => continue,
             };
-            let reason = known.get(path).map_or(reason, String::as_str);
+            let reason = known.get(path).or_else(|| self.files.others.get(path)).map_or(reason, String::as_str);
             let encoded = if shape.len() < 2 { "encoded images, " } else { "" };
             found.entry(path).or_insert((format!("{encoded}{} {shape:?}", key.dtype), reason));
         }
@@ -403,10 +402,10 @@ impl Chooser<'_> {
     }
 
     /// robosuite's sparse reward, and that of everything built on it, is 1 exactly when the task is solved; a shaped one tells
-    /// nothing.
+    /// nothing. LIBERO's own files say `reward_shaping`, but its tasks know no shaped reward.
     fn rewards_tell_success(&self) -> bool {
         let shaped = self.env_kwargs().and_then(|kwargs| kwargs.get("reward_shaping")?.as_bool());
-        self.is_robosuite() && shaped != Some(true)
+        self.is_robosuite() && (shaped != Some(true) || self.plan.dialect == Dialect::Libero)
     }
 
     fn env_kwargs(&self) -> Option<&Value> {

@@ -59,14 +59,12 @@ pub(super) fn read_columns(
             let mut passing = Vec::with_capacity(wanted.len());
             for ((name, feature), array) in wanted.iter().zip(&arrays) {
                 let other = check::stored_as(&path, name, &feature.dtype, array.data_type())?;
-                let mut numbers = read::numbers(&path, name, array, feature.dim())?;
-                if let Some(other) = other {
-                    if feature.dtype == "bool" {
-                        numbers.data = numbers.data.iter().map(|&v| f32::from(u8::from(v != 0.0))).collect();
-                    }
-                    casts.entry(name).or_insert(other);
-                }
-                passing.push(numbers);
+                let Some(other) = other else {
+                    passing.push(read::numbers(&path, name, array, feature.dim())?);
+                    continue;
+                };
+                passing.push(read::numbers_as(&path, name, array, feature.dim(), &feature.dtype)?);
+                casts.entry(name).or_insert(other);
             }
             take(passing);
             let first = row;
@@ -121,9 +119,12 @@ pub(super) fn read_columns(
         notes.push(format!("column {name}: expected {dtype}, as info.json says, found {found}: cast, as LeRobot does"));
     }
     notes.extend(strangers.into_iter().map(|name| {
+        let fate = match INDEX_COLUMNS.contains(&name.as_str()) {
+            true => "a set that is made of this one states it",
+            false => "it is left out, with its values",
+        };
         format!(
-            "column {name}: meta/info.json states no such feature, and LeRobot opens no set with such a column: it is left \
-             out, with its values"
+            "column {name}: meta/info.json states no such feature, and LeRobot opens no set with such a column: {fate}"
         )
     }));
     notes.extend(late.note());

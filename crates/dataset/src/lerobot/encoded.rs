@@ -6,7 +6,7 @@ use crate::error::Result;
 use crate::plan::KeyPlan;
 use crate::source::Source;
 use crate::tree::Dtype;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// Whether a dataset of a demo may hold files: bytes for each step.
 pub(crate) fn may_hold_files(path: &str, key: &KeyPlan) -> bool {
@@ -18,19 +18,30 @@ pub(crate) fn may_hold_files(path: &str, key: &KeyPlan) -> bool {
     bytes && path.starts_with("obs/")
 }
 
-/// Height and width of the pictures of such datasets, by path: those of the first step of the first demo that has one. What begins with no
-/// JPEG file is left out.
-pub(crate) fn sizes(source: &Source) -> Result<BTreeMap<String, (usize, usize)>> {
-    let mut found = BTreeMap::new();
+/// Such datasets by path.
+#[derive(Default)]
+pub(crate) struct Files {
+    /// Height and width of the pictures of those that become a camera.
+    pub sizes: BTreeMap<String, (usize, usize)>,
+    /// Why the JPEG files of others do not.
+    pub others: BTreeMap<String, String>,
+}
+
+/// Looks at the first step of the first demo that has such a dataset. What begins with no JPEG file is left out.
+pub(crate) fn sizes(source: &Source) -> Result<Files> {
+    let (mut found, mut seen) = (Files::default(), BTreeSet::new());
     for (index, demo) in source.plan().demos.iter().enumerate() {
         for (path, _) in demo.keys.iter().filter(|(path, key)| may_hold_files(path, key)) {
-            if !found.contains_key(path) {
-                let row = source.read_rows(index, path, 0, 1)?;
-                let file = row.byte_rows().and_then(|rows| images::jpeg(rows.first()?));
-                let size = file.and_then(|file| images::jpeg_size(file).ok());
-                found.insert(path.to_owned(), size);
+            if !seen.insert(path.to_owned()) {
+                continue;
+            }
+            let row = source.read_rows(index, path, 0, 1)?;
+            let Some(file) = row.byte_rows().and_then(|rows| images::jpeg(rows.first()?)) else { continue };
+            match images::jpeg_size(file) {
+                Ok(size) => drop(found.sizes.insert(path.to_owned(), size)),
+                Err(reason) => drop(found.others.insert(path.to_owned(), format!("its first step is {reason}"))),
             }
         }
     }
-    Ok(found.into_iter().filter_map(|(path, size)| Some((path, size?))).collect())
+    Ok(found)
 }

@@ -2,6 +2,7 @@
 
 use super::chooser::{Chooser, index_columns, usual};
 use super::depth::DepthKind;
+use super::encoded::Files;
 use super::info::{ActionKind, ActionProvenance, Feature, Features, RotationForm};
 use crate::error::{InputError, Result};
 use crate::ffmpeg;
@@ -210,12 +211,8 @@ pub(crate) struct Mapping {
 
 impl Mapping {
     /// Chooses columns for `plan`. Every demo must have every chosen dataset in the same shape. `files` are the datasets of
-    /// JPEG files with height and width of their pictures.
-    pub(crate) fn resolve(
-        plan: &Plan,
-        options: &ConvertOptions,
-        files: &BTreeMap<String, (usize, usize)>,
-    ) -> Result<Self> {
+    /// JPEG files.
+    pub(crate) fn resolve(plan: &Plan, options: &ConvertOptions, files: &Files) -> Result<Self> {
         let first = match options.skip_bad {
             true => usual(plan),
             false => plan.demos.first(),

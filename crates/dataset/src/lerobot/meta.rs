@@ -81,14 +81,15 @@ pub(crate) fn write_episodes(
     // a camera has its places whether or not somebody counted its pictures
     let filmed = rows.first().into_iter().flat_map(|row| row.videos.keys());
     let filmed: Vec<&String> = filmed.filter(|&name| rows.iter().all(|row| row.videos.contains_key(name))).collect();
-    // an episode without frames has no statistics
     let counted: Vec<&(String, bool)> = features.iter().filter(|(name, _)| stats.all_have(name)).collect();
     let mut groups = rows.chunks(EpisodeStats::GROUP).enumerate().map(|(group, part)| {
         let start = group * EpisodeStats::GROUP;
         Ok(episode_columns(start, tasks, &filmed, &counted, part, &stats.group(group)?))
     });
     let first = groups.next().expect("a data set has an episode")?;
-    let field = |(name, array): &(String, ArrayRef)| Field::new(name, array.data_type().clone(), false);
+    // an episode without frames has no statistics
+    let maybe_null = |name: &str| stats.some_lack() && name.starts_with("stats/");
+    let field = |(name, array): &(String, ArrayRef)| Field::new(name, array.data_type().clone(), maybe_null(name));
     let schema = Schema::new(first.iter().map(field).collect::<Vec<_>>());
     let arrays = |columns: Vec<(String, ArrayRef)>| columns.into_iter().map(|(_, array)| array).collect();
     let groups = std::iter::once(Ok(first)).chain(groups).map(|columns| columns.map(arrays));
@@ -133,13 +134,14 @@ fn episode_columns(
         ]);
     }
     for (feature, is_image) in counted {
+        let each = || stats.iter().map(|of_episode| of_episode.get(feature));
         // sets written before quantiles were stored have none
-        for (name, get) in STATISTICS.into_iter().filter(|(_, get)| !stats.iter().any(|s| get(&s[feature]).is_empty()))
-        {
+        let stored = |get: fn(&FeatureStats) -> &Vec<f64>| !each().flatten().any(|stats| get(stats).is_empty());
+        for (name, get) in STATISTICS.into_iter().filter(|(_, get)| stored(*get)) {
             let mut values = Float64Builder::new();
             let mut lengths = Vec::with_capacity(rows.len());
-            for of_episode in stats {
-                let of_row = get(&of_episode[feature]);
+            for of_episode in each() {
+                let of_row = of_episode.map_or(&[][..], |stats| get(stats));
                 values.append_slice(of_row);
                 lengths.push(of_row.len());
             }
@@ -147,9 +149,11 @@ fn episode_columns(
             columns.push((format!("stats/{feature}/{name}"), list));
         }
         let mut counts = ListBuilder::new(Int64Builder::new()).with_field(element(DataType::Int64));
-        for of_episode in stats {
-            counts.values().append_value(of_episode[feature].count as i64);
-            counts.append(true);
+        for of_episode in each() {
+            if let Some(stats) = of_episode {
+                counts.values().append_value(stats.count as i64);
+            }
+            counts.append(of_episode.is_some());
         }
         columns.push((format!("stats/{feature}/count"), Arc::new(counts.finish())));
     }
@@ -174,7 +178,8 @@ const STATISTICS: [Getter; 9] = [
     ("q99", |s| &s.q99),
 ];
 
-/// `list<double>` of the given lengths, or `list<list<list<double>>>` of shape (length, 1, 1) for images.
+/// `list<double>` of the given lengths, or `list<list<list<double>>>` of shape (length, 1, 1) for images; null where there is
+/// nothing.
 fn nested(values: Arc<Float64Array>, lengths: Vec<usize>, is_image: bool) -> ArrayRef {
     let mut inner: ArrayRef = values;
     if is_image {
@@ -183,8 +188,9 @@ fn nested(values: Arc<Float64Array>, lengths: Vec<usize>, is_image: bool) -> Arr
             inner = Arc::new(ListArray::new(element(inner.data_type().clone()), ones, inner, None));
         }
     }
+    let nulls = lengths.contains(&0).then(|| lengths.iter().map(|&length| length > 0).collect());
     let offsets = OffsetBuffer::from_lengths(lengths);
-    Arc::new(ListArray::new(element(inner.data_type().clone()), offsets, inner, None))
+    Arc::new(ListArray::new(element(inner.data_type().clone()), offsets, inner, nulls))
 }
 
 /// `meta/stats.json`.
@@ -319,6 +325,22 @@ fn flatten(value: &Value, out: &mut Vec<f64>) -> Result<(), String> {
         other => {
             out.push(other.as_f64().ok_or_else(|| format!("expected a number, found {other}"))?);
             Ok(())
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    #[test]
+    fn statistics_are_read_to_the_last_bit() {
+        let mut rng = crate::shuffle::SplitMix64::new(3, 0);
+        for _ in 0..1000 {
+            let number = rng.below(1 << 53) as f64 / 2_f64.powi(rng.below(80) as i32);
+            let value = python_json(format!("[{number:e}, NaN]").as_bytes()).unwrap();
+            assert_eq!(value[0].as_f64().map(f64::to_bits), Some(number.to_bits()), "{number:e}");
         }
     }
 }

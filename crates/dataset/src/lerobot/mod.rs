@@ -49,7 +49,7 @@ pub use info::{
 pub(crate) use meta::python_json;
 pub use notes::notes;
 pub(crate) use notes::{mask_note, shared_notes};
-pub use open::{ACTION, Column, Dataset, ENVIRONMENT_STATE, EnvMeta, EpisodeMeta, STATE};
+pub use open::{ACTION, Column, Dataset, ENVIRONMENT_STATE, EnvMeta, EpisodeMeta, STATE, Texts};
 pub use pictures::{CameraFile, PictureFile, PictureStore, Pictures};
 pub(crate) use sharded::refuse as refuse_shard;
 pub use sharded::{Shard, ShardReport, convert_shard, merge_shards, shard_files};

@@ -15,7 +15,7 @@ use crate::stats::FeatureStats;
 use crate::windows::{Resident, WindowSpec, Windows, unmarked};
 use serde_json::Value;
 use sha2::{Digest, Sha256};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
 
 /// Column of a policy's proprioceptive input.
@@ -84,6 +84,40 @@ pub struct Column<'a> {
     pub data: &'a [f32],
     /// Values a frame.
     pub dim: usize,
+}
+
+/// A column of texts, each of which is kept once.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Texts {
+    /// The different texts, in order of first use.
+    pub texts: Vec<String>,
+    /// Each frame's place in `texts`; [`Texts::NONE`] where it has no text.
+    pub frames: Vec<u32>,
+}
+
+impl Texts {
+    /// The number of a frame without a text.
+    pub const NONE: u32 = u32::MAX;
+
+    /// The text of a frame, if it has one.
+    pub fn get(&self, frame: usize) -> Option<&str> {
+        let number = *self.frames.get(frame)?;
+        self.texts.get(number as usize).map(String::as_str)
+    }
+
+    /// Takes the next frame's; `numbers` are those of the texts so far.
+    fn push(&mut self, text: Option<&str>, numbers: &mut HashMap<String, u32>) {
+        let number = match text {
+            None => Self::NONE,
+            Some(text) => numbers.get(text).copied().unwrap_or_else(|| {
+                let number = self.texts.len() as u32;
+                self.texts.push(text.to_owned());
+                numbers.insert(text.to_owned(), number);
+                number
+            }),
+        };
+        self.frames.push(number);
+    }
 }
 
 impl Dataset {
@@ -322,13 +356,16 @@ impl Dataset {
     /// Files that cannot be read, and a number that no task has.
     pub fn frame_tasks(&self) -> Result<Option<Vec<usize>>> {
         let mut all = Vec::with_capacity(self.frames());
+        // the first of two tasks of one number counts
+        let places: HashMap<i64, usize> =
+            self.task_numbers.iter().enumerate().rev().map(|(at, &number)| (number, at)).collect();
         for path in read::files(&self.root, "data")? {
             let (_, arrays) = match read::columns(&path, &["task_index"]) {
                 Err(DatasetError::NotInDataset { .. }) => return Ok(None),
                 columns => columns?,
             };
             for &number in read::integers(&path, "task_index", &arrays[0])?.iter() {
-                let at = self.task_numbers.iter().position(|&task| task == number);
+                let at = places.get(&number).copied();
                 all.push(at.ok_or_else(|| DatasetError::BadDataset {
                     path: path.clone(),
                     object: "column task_index".to_owned(),
@@ -343,19 +380,22 @@ impl Dataset {
     /// The columns of texts, one a frame, by name. LeRobot's `language` columns, which hold lists, are none of them.
     ///
     /// # Errors
-    /// Files that cannot be read, and frames without a text.
-    pub fn texts(&self) -> Result<BTreeMap<String, Vec<String>>> {
+    /// Files that cannot be read.
+    pub fn texts(&self) -> Result<BTreeMap<String, Texts>> {
         let is_text = |(_, feature): &&(String, Feature)| feature.dtype == "string" && feature.dim() == 1;
         let mut names: Vec<&str> = self.info.features.0.iter().filter(is_text).map(|(name, _)| name.as_str()).collect();
         names.sort_unstable();
-        let mut all: BTreeMap<String, Vec<String>> = names.iter().map(|&name| (name.to_owned(), Vec::new())).collect();
+        let mut all: BTreeMap<String, Texts> = names.iter().map(|&name| (name.to_owned(), Texts::default())).collect();
         if names.is_empty() {
             return Ok(all);
         }
+        let mut numbers: Vec<HashMap<String, u32>> = vec![HashMap::new(); names.len()];
         for path in read::files(&self.root, "data")? {
             let (_, arrays) = read::columns(&path, &names)?;
-            for ((name, array), texts) in names.iter().zip(&arrays).zip(all.values_mut()) {
-                texts.extend(read::texts(&path, name, array)?);
+            for (((name, array), texts), numbers) in names.iter().zip(&arrays).zip(all.values_mut()).zip(&mut numbers) {
+                for text in &read::maybe_texts(&path, name, array)? {
+                    texts.push(text, numbers);
+                }
             }
         }
         Ok(all)

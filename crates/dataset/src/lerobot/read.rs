@@ -3,9 +3,11 @@
 use crate::error::{DatasetError, InputError, Result};
 use crate::source::is_lfs_pointer;
 use crate::windows::Resident;
-use arrow_array::{Array, ArrayRef, BooleanArray, FixedSizeListArray, Float32Array, LargeListArray, ListArray};
+use arrow_array::cast::AsArray;
+use arrow_array::types::{Float32Type, Float64Type, Int64Type};
+use arrow_array::{Array, ArrayRef, FixedSizeListArray, LargeListArray, ListArray, StringArray};
 use arrow_buffer::ScalarBuffer;
-use arrow_cast::{CastOptions, cast, cast_with_options};
+use arrow_cast::{CastOptions, cast_with_options};
 use arrow_schema::{ArrowError, DataType};
 use arrow_select::concat::concat;
 use parquet::arrow::ProjectionMask;
@@ -157,19 +159,42 @@ impl BadColumn<'_> {
 /// Numbers of a column as `dim` f32 a row, whatever the stored type and kind of list.
 pub(crate) fn numbers(path: &Path, name: &str, array: &ArrayRef, dim: usize) -> Result<Resident> {
     let column = BadColumn { path, name };
+    floats(&column, leaf(&column, array, array.len(), dim)?, dim)
+}
+
+/// [`numbers`] of a column that is stored as another type than `dtype`, which the feature states and must hold its values.
+pub(crate) fn numbers_as(path: &Path, name: &str, array: &ArrayRef, dim: usize, dtype: &str) -> Result<Resident> {
+    let column = BadColumn { path, name };
     let leaf = leaf(&column, array, array.len(), dim)?;
+    let to = match dtype {
+        "bool" => DataType::Boolean,
+        "int8" => DataType::Int8,
+        "int16" => DataType::Int16,
+        "int32" => DataType::Int32,
+        "int64" => DataType::Int64,
+        "uint8" => DataType::UInt8,
+        "uint16" => DataType::UInt16,
+        "uint32" => DataType::UInt32,
+        "uint64" => DataType::UInt64,
+        _ => return floats(&column, leaf, dim),
+    };
+    let expected = || format!("values of {dtype}, as info.json says");
+    floats(&column, cast_all(&leaf, &to).map_err(|e| column.because(expected(), e.to_string()))?, dim)
+}
+
+fn floats(column: &BadColumn<'_>, leaf: ArrayRef, dim: usize) -> Result<Resident> {
     let floats = match leaf.data_type() {
         DataType::Float32 => leaf,
         DataType::Boolean => {
-            let flags = leaf.as_any().downcast_ref::<BooleanArray>().expect("a boolean column");
-            let values: Vec<f32> = flags.values().iter().map(|b| f32::from(u8::from(b))).collect();
+            let values: Vec<f32> = leaf.as_boolean().values().iter().map(|b| f32::from(u8::from(b))).collect();
             return Ok(Resident { data: values.into(), dim });
         }
-        t if t.is_numeric() => cast(&leaf, &DataType::Float32).map_err(|e| column.because("numbers", e.to_string()))?,
+        t if t.is_numeric() => {
+            cast_all(&leaf, &DataType::Float32).map_err(|e| column.because("numbers", e.to_string()))?
+        }
         t => return Err(column.because("numbers", t.to_string())),
     };
-    let floats = floats.as_any().downcast_ref::<Float32Array>().expect("a float column");
-    Ok(Resident { data: floats.values().clone(), dim })
+    Ok(Resident { data: floats.as_primitive::<Float32Type>().values().clone(), dim })
 }
 
 /// Unwraps lists down to values: every row must hold exactly `dim` of them, none may be null.
@@ -220,35 +245,41 @@ pub(crate) fn cast_all(array: &ArrayRef, to: &DataType) -> std::result::Result<A
     cast_with_options(array, to, &CastOptions { safe: false, ..CastOptions::default() })
 }
 
-/// A column of whole numbers.
+/// A column of one whole number a row.
 pub(crate) fn integers(path: &Path, name: &str, array: &ArrayRef) -> Result<ScalarBuffer<i64>> {
     let column = BadColumn { path, name };
-    if array.null_count() > 0 || !array.data_type().is_integer() {
-        return Err(column.because("whole numbers", format!("{} with {} nulls", array.data_type(), array.null_count())));
+    let leaf = leaf(&column, array, array.len(), 1)?;
+    if !leaf.data_type().is_integer() {
+        return Err(column.because("whole numbers", leaf.data_type().to_string()));
     }
-    let cast = cast_all(array, &DataType::Int64).map_err(|e| column.because("64-bit numbers", e.to_string()))?;
-    let longs = cast.as_any().downcast_ref::<arrow_array::Int64Array>().expect("an int64 column");
-    Ok(longs.values().clone())
+    let longs = cast_all(&leaf, &DataType::Int64).map_err(|e| column.because("64-bit numbers", e.to_string()))?;
+    Ok(longs.as_primitive::<Int64Type>().values().clone())
 }
 
 /// A column of one number a row, in full precision.
 pub(crate) fn doubles(path: &Path, name: &str, array: &ArrayRef) -> Result<ScalarBuffer<f64>> {
     let column = BadColumn { path, name };
-    if array.null_count() > 0 || !array.data_type().is_numeric() {
-        return Err(column.because("numbers", format!("{} with {} nulls", array.data_type(), array.null_count())));
+    let leaf = leaf(&column, array, array.len(), 1)?;
+    if !leaf.data_type().is_numeric() {
+        return Err(column.because("numbers", leaf.data_type().to_string()));
     }
-    let cast = cast(array, &DataType::Float64).map_err(|e| column.because("numbers", e.to_string()))?;
-    let doubles = cast.as_any().downcast_ref::<arrow_array::Float64Array>().expect("a column of doubles");
-    Ok(doubles.values().clone())
+    let doubles = cast_all(&leaf, &DataType::Float64).map_err(|e| column.because("numbers", e.to_string()))?;
+    Ok(doubles.as_primitive::<Float64Type>().values().clone())
+}
+
+/// A column of texts, any of which may be missing.
+pub(crate) fn maybe_texts(path: &Path, name: &str, array: &ArrayRef) -> Result<StringArray> {
+    let column = BadColumn { path, name };
+    let plain = cast_all(array, &DataType::Utf8).map_err(|e| column.because("texts", e.to_string()))?;
+    Ok(plain.as_string().clone())
 }
 
 /// A column of texts.
 pub(crate) fn texts(path: &Path, name: &str, array: &ArrayRef) -> Result<Vec<String>> {
-    let column = BadColumn { path, name };
-    let plain = cast(array, &DataType::Utf8).map_err(|e| column.because("texts", e.to_string()))?;
-    let plain = plain.as_any().downcast_ref::<arrow_array::StringArray>().expect("a text column");
+    let plain = maybe_texts(path, name, array)?;
     if plain.null_count() > 0 {
-        return Err(column.because("a text in every row", format!("{} nulls", plain.null_count())));
+        let found = format!("{} nulls", plain.null_count());
+        return Err(BadColumn { path, name }.because("a text in every row", found));
     }
     Ok(plain.iter().flatten().map(str::to_owned).collect())
 }

@@ -113,7 +113,7 @@ impl<'a> Tally<'a> {
             }
             self.values[index].add(summary.values)?;
         }
-        self.each.add(&of_episode)
+        self.each.add(&of_episode, part.length)
     }
 
     /// The statistics of the whole and the fingerprint.

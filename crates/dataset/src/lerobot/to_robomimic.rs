@@ -10,19 +10,18 @@ use super::fingerprint::INDEX_COLUMNS;
 use super::images;
 use super::info::{Feature, Info};
 use super::open::{Dataset, EpisodeMeta};
-use super::read::{BadColumn, leaf, texts};
+use super::read::{BadColumn, cast_all, leaf, texts};
 use super::skip;
 use super::tiff;
 use crate::error::{DatasetError, InputError, Result};
 use crate::plan::Plan;
-use crate::source::{NonFinite, RobomimicWriter, Source, WriteOptions};
+use crate::source::{NonFinite, RobomimicWriter, Source, WriteOptions, list};
 use crate::tree::{Array, Attrs, Demo, Dtype};
 use arrow_array::ArrayRef;
 use arrow_array::cast::AsArray;
 use arrow_array::types::{
     Float32Type, Float64Type, Int8Type, Int16Type, Int32Type, Int64Type, UInt8Type, UInt16Type, UInt32Type, UInt64Type,
 };
-use arrow_cast::cast;
 use arrow_schema::DataType;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
@@ -94,7 +93,7 @@ fn dtype_of(feature: &Feature) -> Dtype {
 fn bytes_of(array: &ArrayRef, dtype: &Dtype) -> Result<Vec<u8>, String> {
     macro_rules! numbers {
         ($kind:ty, $type:expr) => {{
-            let array = cast(array, &$type).map_err(|e| e.to_string())?;
+            let array = cast_all(array, &$type).map_err(|e| e.to_string())?;
             array.as_primitive::<$kind>().values().iter().flat_map(|v| v.to_le_bytes()).collect()
         }};
     }
@@ -109,7 +108,7 @@ fn bytes_of(array: &ArrayRef, dtype: &Dtype) -> Result<Vec<u8>, String> {
         Dtype::U16 => numbers!(UInt16Type, DataType::UInt16),
         Dtype::U8 => numbers!(UInt8Type, DataType::UInt8),
         Dtype::Bool => {
-            let array = cast(array, &DataType::Boolean).map_err(|e| e.to_string())?;
+            let array = cast_all(array, &DataType::Boolean).map_err(|e| e.to_string())?;
             array.as_boolean().values().iter().map(u8::from).collect()
         }
         _ => numbers!(Float32Type, DataType::Float32),
@@ -166,6 +165,11 @@ pub(super) fn from_columns(
     };
     let ids: Vec<String> =
         set.episodes().iter().map(|e| e.demo.clone().unwrap_or_else(|| format!("demo_{}", e.index))).collect();
+    let empty: Vec<&str> =
+        set.episodes().iter().zip(&ids).filter(|(e, _)| e.length == 0).map(|(_, id)| &**id).collect();
+    if !empty.is_empty() {
+        notes.push(format!("episodes without frames become demos without steps: {}", list(empty.into_iter())));
+    }
     let mut writer = RobomimicWriter::create(out, options)?;
     let total = set.frames() as u64;
     let text =
@@ -404,7 +408,7 @@ pub fn rewrite(
     without_observations(&input)?;
     skip::none(&input)?;
     let plan = input.plan();
-    let files = encoded::sizes(&input)?;
+    let files = encoded::sizes(&input)?.sizes;
     let mut root = input.root()?;
     let data: &mut Attrs = root.inner_attrs.entry("data".to_owned()).or_default();
     data.insert("total".to_owned(), Array::from_i64(Vec::new(), &[plan.frames() as i64]));

@@ -155,6 +155,8 @@ pub(crate) struct EpisodeStats {
     groups: Vec<(u64, usize)>,
     waiting: Vec<u8>,
     episodes: usize,
+    /// Those of them that have no frames, and no statistics.
+    empty: usize,
 }
 
 impl EpisodeStats {
@@ -162,11 +164,15 @@ impl EpisodeStats {
     pub(crate) const GROUP: usize = 1000;
 
     pub(crate) fn new(folder: &Path) -> Self {
-        Self { spill: Spill::new(folder), names: Vec::new(), groups: Vec::new(), waiting: Vec::new(), episodes: 0 }
+        let (names, groups, waiting) = (Vec::new(), Vec::new(), Vec::new());
+        Self { spill: Spill::new(folder), names, groups, waiting, episodes: 0, empty: 0 }
     }
 
-    /// Takes those of the next episode.
-    pub(crate) fn add(&mut self, stats: &BTreeMap<String, FeatureStats>) -> Result<()> {
+    /// Takes those of the next episode, of so many frames.
+    pub(crate) fn add(&mut self, stats: &BTreeMap<String, FeatureStats>, frames: usize) -> Result<()> {
+        let none = BTreeMap::new();
+        let stats = if frames == 0 { &none } else { stats };
+        self.empty += usize::from(frames == 0);
         put(&mut self.waiting, stats.len() as u64);
         for (name, stats) in stats {
             let at = self.names.iter().position(|(known, _)| known == name).unwrap_or_else(|| {
@@ -190,9 +196,14 @@ impl EpisodeStats {
         Ok(())
     }
 
-    /// Whether every episode has statistics of a feature.
+    /// Whether every episode that has frames has statistics of a feature.
     pub(crate) fn all_have(&self, feature: &str) -> bool {
-        self.names.iter().any(|(name, episodes)| name == feature && *episodes == self.episodes)
+        self.names.iter().any(|(name, episodes)| name == feature && *episodes == self.episodes - self.empty)
+    }
+
+    /// Whether an episode has none.
+    pub(crate) fn some_lack(&self) -> bool {
+        self.empty > 0
     }
 
     /// Those of the episodes from `group * GROUP` on.
@@ -226,7 +237,7 @@ impl EpisodeStats {
         Ok(episodes)
     }
 
-    /// Those of one feature, where every episode has them.
+    /// Those of one feature, where every episode that has frames has them.
     pub(crate) fn of_feature(&self, feature: &str) -> Result<Option<Vec<FeatureStats>>> {
         if !self.all_have(feature) {
             return Ok(None);
@@ -316,7 +327,7 @@ mod tests {
             }
             all
         };
-        (0..2100).for_each(|i| kept.add(&of(i)).unwrap());
+        (0..2100).for_each(|i| kept.add(&of(i), 1).unwrap());
         assert!(kept.all_have("a") && !kept.all_have("b") && !kept.all_have("c"));
         for group in 0..3 {
             let last = 2100.min(1000 * group + 1000);

@@ -283,7 +283,7 @@ fn show(root: &Path, view: &Path, notes: &mut Vec<String>) -> Result<()> {
             place: Place { folder: number / FILES_PER_FOLDER, file: number % FILES_PER_FOLDER },
             videos,
         });
-        each.add(&stats.remove(&number).unwrap_or_default())?;
+        each.add(&stats.remove(&number).unwrap_or_default(), length)?;
         from += length;
     }
     if !others.is_empty() {

@@ -160,7 +160,7 @@ fn d4rl_arrays_of_another_length_are_named() {
     };
     assert!(run(10).unwrap()[0].starts_with("rewards has 9 rows where actions has 10"), "{:?}", run(10));
     let error = run(8).unwrap_err();
-    assert!(error.ends_with("observations: expected 10 (the actions) steps, found shape [8, 4]"), "{error}");
+    assert!(error.ends_with("by observations: expected 10 steps, as actions has, found shape [8, 4]"), "{error}");
 }
 
 fn episode(path: &Path, steps: usize) {

@@ -115,6 +115,11 @@ enum Field<'a> {
     Fixed(u32),
 }
 
+/// What is left out without a demo being lost: the reason, and the record where it was seen first, by name.
+type LeftOut = BTreeMap<String, String>;
+
+/// Why a text is left out.
+const NO_TEXT: &str = "bytes that are no UTF-8 text";
 const CUT: &str = "a message that is cut off";
 
 fn varint(rest: &mut &[u8]) -> Result<u64, String> {
@@ -159,7 +164,7 @@ fn fields<'a>(message: &'a [u8], take: &mut dyn FnMut(u64, Field<'a>) -> Result<
     Ok(())
 }
 
-/// The lists of an example by name: kind (1 bytes, 2 floats, 3 whole numbers) and content.
+/// The lists of an example by name: kind (1 bytes, 2 floats, 3 whole numbers, 0 of a list without one) and content.
 type Lists<'a> = BTreeMap<&'a str, (u64, &'a [u8])>;
 
 fn lists(record: &[u8]) -> Result<Lists<'_>, String> {
@@ -167,13 +172,13 @@ fn lists(record: &[u8]) -> Result<Lists<'_>, String> {
     fields(record, &mut |number, field| match (number, field) {
         (1, Field::Bytes(features)) => fields(features, &mut |number, entry| {
             let (1, Field::Bytes(entry)) = (number, entry) else { return Ok(()) };
-            let (mut name, mut list) = ("", None);
+            let (mut name, mut list) = ("", (0, &[][..]));
             fields(entry, &mut |number, field| {
                 match (number, field) {
                     (1, Field::Bytes(text)) => name = std::str::from_utf8(text).map_err(|e| e.to_string())?,
                     (2, Field::Bytes(feature)) => fields(feature, &mut |kind, field| {
                         if let Field::Bytes(content) = field {
-                            list = Some((kind, content));
+                            list = (kind, content);
                         }
                         Ok(())
                     })?,
@@ -181,7 +186,7 @@ fn lists(record: &[u8]) -> Result<Lists<'_>, String> {
                 }
                 Ok(())
             })?;
-            found.extend(list.map(|list| (name, list)));
+            found.insert(name, list);
             Ok(())
         }),
         _ => Ok(()),
@@ -405,11 +410,14 @@ impl Rlds {
         }
         let mut found = Vec::new();
         leaves(&features, "", 16, &mut found);
-        let mut problems = Vec::new();
+        let (mut problems, mut left_out) = (Vec::new(), LeftOut::new());
         let mut metadata = Vec::new();
         for (name, feature) in found {
             let step = name.strip_prefix("steps/");
             match (form(feature), step) {
+                (Ok((Form::Images, _)), None) => {
+                    left_out.insert(name, "images of an episode have no place".to_owned());
+                }
                 (Ok((form, shape)), None) => metadata.push(Leaf { key: name.clone(), name, form, shape }),
                 (Ok((form, shape)), Some(step)) => {
                     let key = key_of(step);
@@ -420,7 +428,9 @@ impl Rlds {
                     let error = InputError::Unsupported { path, object, what: one_line(&what) };
                     problems.push(Problem::new(None, Some(&key_of(step)), true, error));
                 }
-                (Err(_), None) => {}
+                (Err(what), None) => {
+                    left_out.insert(name, format!("{} is not supported", one_line(&what)));
+                }
             }
         }
         if self.leaves.is_empty() {
@@ -439,7 +449,7 @@ impl Rlds {
                 let stated = stated.as_u64().or_else(|| stated.as_str()?.parse().ok());
                 let lost = |problems: &[Problem]| problems.iter().filter(|p| p.demo.is_some()).count();
                 let (whole, before) = (demos.len(), demos.len() + lost(&problems));
-                self.read_shard(&file, &metadata, &mut demos, &mut problems, beat)?;
+                self.read_shard(&file, &metadata, &mut demos, (&mut problems, &mut left_out), beat)?;
                 let after = demos.len() + lost(&problems);
                 if stated.is_some_and(|stated| stated != (after - before) as u64) {
                     let reason = format!(
@@ -461,7 +471,8 @@ impl Rlds {
             // the folder is called after the version
             demo.task.get_or_insert_with(|| info.name.clone());
         }
-        let mut notes = Vec::new();
+        let mut notes: Vec<String> =
+            left_out.iter().map(|(name, reason)| format!("{name} is left out: {reason}")).collect();
         let several: Vec<&str> = self.records.iter().filter(|r| r.several).map(|r| r.id.as_str()).collect();
         if !several.is_empty() {
             let ids = super::dialect::list(several.into_iter());
@@ -508,7 +519,7 @@ impl Rlds {
         path: &Path,
         metadata: &[Leaf],
         demos: &mut Vec<DemoPlan>,
-        problems: &mut Vec<Problem>,
+        (problems, left_out): (&mut Vec<Problem>, &mut LeftOut),
         beat: &mut dyn FnMut(),
     ) -> Result<(), InputError> {
         let unreadable = |e: std::io::Error| InputError::Unreadable { path: path.to_owned(), reason: e.to_string() };
@@ -547,7 +558,9 @@ impl Rlds {
             let id = format!("demo_{position}");
             let sound = masked_crc(&content) == u32::from_le_bytes(crc[..].try_into().unwrap_or_default());
             let episode = match sound {
-                true => self.episode(&content, metadata),
+                true => self.episode(&content, metadata, &mut |name, reason| {
+                    left_out.entry(name.to_owned()).or_insert_with(|| format!("{reason} in {id}"));
+                }),
                 false => Err("its checksum is wrong".to_owned()),
             };
             match episode {
@@ -576,19 +589,25 @@ impl Rlds {
         Ok(())
     }
 
-    /// Steps, keys, attributes and instruction of a record, and whether there are others.
+    /// Steps, keys, attributes and instruction of a record, and whether there are others. Tells what it leaves out, and why.
     #[allow(clippy::type_complexity)]
     fn episode(
         &self,
         record: &[u8],
         metadata: &[Leaf],
+        leave_out: &mut dyn FnMut(&str, &str),
     ) -> Result<(usize, BTreeMap<String, KeyPlan>, Attrs, Option<(String, bool)>), String> {
         let lists = lists(record)?;
         let mut steps: Option<(usize, &str)> = None;
         let mut keys = BTreeMap::new();
         let mut task: Option<(usize, (String, bool))> = None;
+        let mut bare = false;
         for leaf in &self.leaves {
             let Some(&(kind, list)) = lists.get(leaf.name.as_str()) else { continue };
+            if kind == 0 {
+                bare = true;
+                continue;
+            }
             let (all, width) = (count(kind, list)?, leaf.shape.iter().product::<usize>());
             let here = all / width.max(1);
             if here * width != all || here > MAX_STEPS {
@@ -600,6 +619,9 @@ impl Rlds {
                 }
                 _ => steps = Some((here, &leaf.name)),
             }
+            if here == 0 {
+                continue;
+            }
             let (mut key, mut dtype, mut shape) = (leaf.key.clone(), Dtype::U8, vec![here]);
             match &leaf.form {
                 Form::Numbers(stated) => {
@@ -608,8 +630,8 @@ impl Rlds {
                 }
                 Form::Text => {
                     let texts = byte_strings(list)?;
-                    // text that is none stays out of the way
                     if texts.iter().any(|text| std::str::from_utf8(text).is_err()) {
+                        leave_out(&leaf.name, NO_TEXT);
                         continue;
                     }
                     let said = texts.iter().find(|text| !text.is_empty());
@@ -639,23 +661,36 @@ impl Rlds {
         }
         let mut attrs = Attrs::new();
         for leaf in metadata {
-            let Some(&(kind, list)) = lists.get(leaf.name.as_str()) else { continue };
+            let Some(&(kind, list)) = lists.get(leaf.name.as_str()).filter(|(kind, _)| *kind > 0) else { continue };
             let value = match &leaf.form {
                 Form::Numbers(dtype) => {
                     let bytes = elements(kind, list, dtype).map_err(|e| format!("{}: {e}", leaf.name))?;
                     let expected = leaf.shape.iter().product::<usize>() * dtype.size().unwrap_or(0);
-                    (bytes.len() == expected).then(|| Array { dtype: dtype.clone(), shape: leaf.shape.clone(), bytes })
+                    let whole = Array { dtype: dtype.clone(), shape: leaf.shape.clone(), bytes };
+                    if whole.bytes.len() == expected {
+                        Ok(whole)
+                    } else {
+                        Err("another number of elements than stated")
+                    }
                 }
                 Form::Text => {
                     let texts = byte_strings(list)?;
-                    texts.first().and_then(|text| std::str::from_utf8(text).ok()).map(Array::from_str)
+                    let text = texts.first().ok_or("no text");
+                    text.and_then(|text| std::str::from_utf8(text).ok().ok_or(NO_TEXT)).map(Array::from_str)
                 }
-                Form::Images => None,
+                Form::Images => continue,
             };
             let name = leaf.name.strip_prefix("episode_metadata/").unwrap_or(&leaf.name);
-            attrs.extend(value.map(|value| (name.to_owned(), value)));
+            match value {
+                Ok(value) => drop(attrs.insert(name.to_owned(), value)),
+                Err(reason) => leave_out(&leaf.name, reason),
+            }
         }
-        let (steps, _) = steps.ok_or("none of the steps that features.json states")?;
+        let steps = match steps {
+            Some((steps, _)) => steps,
+            None if bare => 0,
+            None => return Err("none of the steps that features.json states".to_owned()),
+        };
         Ok((steps, keys, attrs, task.map(|(_, said)| said)))
     }
 

@@ -167,6 +167,32 @@ fn writer_refuses_an_existing_path_and_leaves_nothing_unfinished() {
 }
 
 #[test]
+fn only_what_dead_writers_left_is_removed() {
+    let dir = tempfile::tempdir().unwrap();
+    // no process has the largest number, and the first one lives
+    let names =
+        [".a.hdf5.2147483647-Ab12cd.part", ".a.hdf5.1-Ab12cd.part", ".a.hdf5.backup.part", ".a.hdf5.x-Ab12cd.part"];
+    names.iter().for_each(|name| std::fs::write(dir.path().join(name), "theirs").unwrap());
+    RobomimicWriter::create(&dir.path().join("a.hdf5"), &WriteOptions::default()).unwrap();
+    let left: Vec<bool> = names.iter().map(|name| dir.path().join(name).exists()).collect();
+    assert_eq!(left, [false, true, true, true]);
+}
+
+#[test]
+fn files_are_written_where_hdf5_locks_them() {
+    // libhdf5 reads the variable once
+    for value in ["TRUE", "1", "BEST_EFFORT", "FALSE"] {
+        let run = std::process::Command::new(std::env::current_exe().unwrap())
+            .args(["--exact", "source::tests::writer_refuses_an_existing_path_and_leaves_nothing_unfinished"])
+            .env("HDF5_USE_FILE_LOCKING", value)
+            .output()
+            .unwrap();
+        let text = String::from_utf8_lossy(&run.stdout);
+        assert!(run.status.success() && text.contains("1 passed"), "{value}: {text}");
+    }
+}
+
+#[test]
 fn every_kind_of_element_survives() {
     let mut demo = small_demo("demo_0", 4);
     let mut put = |name: &str, array: Array| demo.datasets.insert(format!("extra/{name}"), array);

@@ -22,6 +22,8 @@ pub struct WriteOptions {
 const BLOCK: usize = 256 << 10;
 /// What an object may take beyond its elements.
 const OVERHEAD: u64 = 256 << 10;
+/// Letters and digits that tell unfinished files of one process apart.
+const RANDOM: usize = 6;
 /// Smaller datasets are not worth packing.
 const WORTH_PACKING: usize = 1 << 10;
 
@@ -59,12 +61,11 @@ impl RobomimicWriter {
         sweep(folder, &name);
         let temporary = tempfile::Builder::new()
             .prefix(&format!(".{name}.{}-", process()))
+            .rand_bytes(RANDOM)
             .suffix(".part")
             .permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666))
             .tempfile_in(folder)
             .map_err(io("create a file beside it"))?;
-        // where there are no locks nobody sweeps either
-        let _ = temporary.as_file().try_lock();
         let file = hdf5::File::with_options()
             .with_fcpl(|p| p.obj_track_times(false))
             // since 1.8 an attribute may exceed 64 KB; a model_file does
@@ -75,6 +76,8 @@ impl RobomimicWriter {
                 object: "the file".to_owned(),
                 source,
             })?;
+        // for those that sweep on another machine; libhdf5, which may lock the file itself, opens it first
+        let _ = temporary.as_file().try_lock();
         let mut writer = Self {
             path: path.to_owned(),
             temporary,
@@ -248,31 +251,41 @@ fn process() -> i32 {
     rustix::process::getpid().as_raw_nonzero().get()
 }
 
-/// Removes what killed writers of the file `name` left. Best effort: what is locked is in use.
+/// Removes what killed writers of the file `name` left. Best effort: what is locked, or of a process that lives, is in
+/// use.
 fn sweep(folder: &Path, name: &str) {
-    for path in unfinished(folder, &format!(".{name}.")) {
-        if File::open(&path).is_ok_and(|file| file.try_lock().is_ok()) {
+    for (path, owner) in unfinished(folder, name) {
+        // in a container every run may have the same number
+        let dead = owner == process() || rustix::process::Pid::from_raw(owner).is_none_or(is_dead);
+        if dead && File::open(&path).is_ok_and(|file| file.try_lock().is_ok()) {
             let _ = std::fs::remove_file(path);
         }
     }
 }
 
+fn is_dead(process: rustix::process::Pid) -> bool {
+    rustix::process::test_kill_process(process) == Err(rustix::io::Errno::SRCH)
+}
+
 /// Removes the unfinished file that this process keeps beside `path`: before it ends without unwinding.
 pub fn remove_unfinished(path: &Path) {
     let name = path.file_name().unwrap_or_default().to_string_lossy();
-    for unfinished in unfinished(folder_of(path), &format!(".{name}.{}-", process())) {
+    for (unfinished, _) in unfinished(folder_of(path), &name).filter(|(_, owner)| *owner == process()) {
         // what stays is removed by the next writer
         let _ = std::fs::remove_file(unfinished);
     }
 }
 
-fn unfinished(folder: &Path, begins: &str) -> Vec<PathBuf> {
-    let Ok(items) = std::fs::read_dir(folder) else { return Vec::new() };
-    let names = |path: &PathBuf| {
-        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        name.starts_with(begins) && name.ends_with(".part")
+/// Unfinished files of the name `name` in a folder, each with the process that writes it.
+fn unfinished(folder: &Path, name: &str) -> impl Iterator<Item = (PathBuf, i32)> {
+    let begin = format!(".{name}.");
+    let owner = move |item: std::fs::DirEntry| {
+        let found = item.file_name();
+        let (process, random) = found.to_str()?.strip_prefix(&begin)?.strip_suffix(".part")?.split_once('-')?;
+        let ours = random.len() == RANDOM && random.bytes().all(|byte| byte.is_ascii_alphanumeric());
+        Some((item.path(), process.parse().ok().filter(|_| ours)?))
     };
-    items.flatten().map(|item| item.path()).filter(names).collect()
+    std::fs::read_dir(folder).into_iter().flatten().flatten().filter_map(owner)
 }
 
 /// Takes `step` bytes of the disk for a file of which `from` bytes are taken and which is about to grow to `end`.

@@ -143,6 +143,24 @@ fn a_file_that_is_broken_or_of_another_size_is_named() {
 }
 
 #[test]
+fn liberos_rewards_are_sparse_whatever_its_files_say() {
+    let dir = tempfile::tempdir().unwrap();
+    let (source, out) = (dir.path().join("open_demo.hdf5"), dir.path().join("set"));
+    crate::made::libero(&source, "open it");
+    let file = hdf5::File::open_rw(&source).unwrap();
+    let data = file.group("data").unwrap();
+    data.delete_attr("env_args").unwrap();
+    let args = r#"{"env_name": "Libero", "type": 1, "env_kwargs": {"control_freq": 20, "reward_shaping": true}}"#;
+    crate::made::text(&data, "env_args", args);
+    for (demo, rewards) in [("demo_0", vec![0.0_f32, 0.0, 1.0]), ("demo_1", vec![0.0, 1.0])] {
+        data.dataset(&format!("{demo}/rewards")).unwrap().write_raw(&rewards).unwrap();
+    }
+    drop((data, file));
+    let (set, _) = converted(&source, &out);
+    assert_eq!(column(&set, "next.success"), [0.0, 0.0, 1.0, 0.0, 1.0]);
+}
+
+#[test]
 fn rows_of_other_bytes_stay_what_they_are() {
     let dir = tempfile::tempdir().unwrap();
     let (source, out) = (dir.path().join("aloha"), dir.path().join("set"));
@@ -151,6 +169,16 @@ fn rows_of_other_bytes_stay_what_they_are() {
     let report = convert(&source, &out, &options(), &mut quiet).unwrap();
     assert!(report.notes.iter().any(|note| note.contains("obs/images/top (encoded images")), "{:?}", report.notes);
     assert_eq!(Dataset::open(&out).unwrap().cameras().count(), 0);
+    // the headers of a grey JPEG file of 8 x 8: start of frame with one component, start of scan
+    let frame = [0xFF, 0xC0, 0, 11, 8, 0, 8, 0, 8, 1, 1, 0x11, 0];
+    let scan = [0xFF, 0xDA, 0, 8, 1, 1, 0, 0, 63, 0, 1, 0xFF, 0xD9];
+    let grey = [&[0xFF, 0xD8][..], &frame, &scan].concat();
+    episode(&source.join("episode_0.hdf5"), &[grey.clone(), grey], 0);
+    let notes = convert(&source, &dir.path().join("grey"), &options(), &mut quiet).unwrap().notes;
+    assert!(
+        notes.iter().any(|note| note.contains("becomes no column: its first step is a grey JPEG file")),
+        "{notes:?}"
+    );
 }
 
 /// Converts without any option; the result passes every check.

@@ -8,7 +8,8 @@ use arrow_array::builder::{ListBuilder, StringBuilder};
 use arrow_array::cast::AsArray;
 use arrow_array::types::{Float32Type, Float64Type, Int64Type};
 use arrow_array::{
-    Array as _, ArrayRef, BinaryArray, Float32Array, Float64Array, Int64Array, RecordBatch, StringArray, StructArray,
+    Array as _, ArrayRef, BinaryArray, FixedSizeListArray, Float32Array, Float64Array, Int64Array, RecordBatch,
+    StringArray, StructArray,
 };
 use arrow_cast::cast;
 use arrow_schema::{DataType, Field};
@@ -573,6 +574,16 @@ fn an_episode_without_frames_is_named() {
     edit_numbers(&set, EPISODES, "dataset_from_index", |row, number| if row == last { frames } else { number });
     edit_json(&set, INFO, |info| info["total_episodes"] = json!(DEMOS + 1));
     named(&verify(&set, &mut quiet).unwrap(), "empty", &["length, episode 12, row 12: expected 1 or more, found 0"]);
+    // the others keep their statistics
+    let out = dir.path().join("out");
+    keep(&set, &Destination::New(out.clone()), &numbers(10..DEMOS + 1), &mut quiet).unwrap();
+    let (before, after) = (read_table(&set.join(EPISODES)), read_table(&out.join(EPISODES)));
+    for name in ["stats/action/mean", "stats/action/count"] {
+        let (before, after) = (before.column_by_name(name).unwrap(), after.column_by_name(name).unwrap());
+        assert_eq!((before.slice(10, 2).as_ref(), after.is_null(2)), (after.slice(0, 2).as_ref(), true), "{name}");
+    }
+    let notes = export(&out, &dir.path().join("out.hdf5"), &WriteOptions::default(), &mut quiet).unwrap().notes;
+    assert!(notes.contains(&"episodes without frames become demos without steps: demo_2".to_owned()), "{notes:?}");
 }
 
 #[test]
@@ -595,10 +606,88 @@ fn other_types_are_cast_as_lerobot_casts_them() {
         (after.column("next.done"), after.column("next.reward"))
     );
     assert_eq!(before.fingerprint(), after.fingerprint());
+    // whole numbers that the stated type holds, and one that it does not
+    let out = dir.path().join("out.hdf5");
+    edit_json(&set, INFO, |info| info["features"]["next.reward"]["dtype"] = json!("int8"));
+    for (most, file) in [(100, &out), (1000, &dir.path().join("no.hdf5"))] {
+        for number in 0..3 {
+            edit_table(&set, &format!("data/chunk-000/file-00{number}.parquet"), |table| {
+                let rewards = Int64Array::from_iter_values((0..table.num_rows() as i64).map(|row| row.min(1) * most));
+                with_column(&table, "next.reward", |_| Arc::new(rewards.clone()))
+            });
+        }
+        for found in [Dataset::open(&set).map(drop), export(&set, file, &WriteOptions::default(), &mut quiet).map(drop)]
+        {
+            match most {
+                100 => found.unwrap(),
+                _ => {
+                    let text = found.unwrap_err().to_string();
+                    assert!(
+                        text.contains("column next.reward") && text.contains("int8") && text.contains("1000"),
+                        "{text}"
+                    );
+                }
+            }
+        }
+    }
     // texts are no numbers
     edit_table(&set, DATA, |table| with_column(&table, "next.reward", |column| cast(column, &DataType::Utf8).unwrap()));
     let refused = Dataset::open(&set).unwrap_err().to_string();
     assert!(refused.contains("next.reward") && refused.contains("found utf8"), "{refused}");
+}
+
+#[test]
+fn index_columns_are_written_flat_and_stated() {
+    let dir = tempfile::tempdir().unwrap();
+    let (set, out) = (dir.path().join("set"), dir.path().join("out"));
+    sound(&set);
+    std::fs::remove_dir_all(set.join("actrm")).unwrap();
+    let expected = Dataset::open(&set).unwrap().frame_tasks().unwrap();
+    let names = ["timestamp", "task_index", "index"];
+    for number in 0..3 {
+        for name in names {
+            edit_table(&set, &format!("data/chunk-000/file-00{number}.parquet"), |table| {
+                with_column(&table, name, |column| {
+                    let kind = Arc::new(Field::new("element", column.data_type().clone(), false));
+                    Arc::new(FixedSizeListArray::new(kind, 1, Arc::clone(column), None))
+                })
+            });
+        }
+    }
+    edit_json(&set, INFO, |info| drop(info["features"].as_object_mut().unwrap().remove("index")));
+    assert!(verify(&set, &mut quiet).is_ok());
+    let report = keep(&set, &Destination::New(out.clone()), &numbers(0..DEMOS), &mut quiet).unwrap();
+    assert!(report.notes.iter().any(|note| note.starts_with("column index: ") && note.ends_with("states it")));
+    let table = read_table(&out.join(DATA));
+    assert!(names.iter().all(|name| table.column_by_name(name).unwrap().data_type().is_numeric()), "{table:?}");
+    let again = Dataset::open(&out).unwrap();
+    assert_eq!((again.notes(), again.frame_tasks().unwrap()), (&[][..], expected));
+    assert!(again.info().features.0.iter().any(|(name, _)| name == "index"));
+}
+
+#[test]
+fn texts_are_kept_once_and_may_be_missing() {
+    let dir = tempfile::tempdir().unwrap();
+    let set = dir.path().join("set");
+    sound(&set);
+    std::fs::remove_dir_all(set.join("actrm")).unwrap();
+    edit_json(&set, INFO, |info| info["features"]["note"] = json!({"dtype": "string", "shape": [1], "names": null}));
+    for number in 0..3 {
+        edit_table(&set, &format!("data/chunk-000/file-00{number}.parquet"), |table| {
+            let text = |row| [Some("reach"), None, Some("grasp")][(row + number) % 3];
+            let texts = StringArray::from_iter((0..table.num_rows()).map(text));
+            let note: (String, ArrayRef) = ("note".to_owned(), Arc::new(texts));
+            let schema = table.schema();
+            let names = schema.fields().iter().map(|field| field.name().clone());
+            let columns = names.zip(table.columns().to_vec()).chain([note]);
+            RecordBatch::try_from_iter_with_nullable(columns.map(|(name, column)| (name, column, true))).unwrap()
+        });
+    }
+    let texts = Dataset::open(&set).unwrap().texts().unwrap().remove("note").unwrap();
+    assert_eq!((texts.texts.len(), texts.frames.len()), (2, DEMOS * FRAMES));
+    let first = DEMOS * FRAMES / 3;
+    let found: Vec<_> = [0, 1, 2, first, first + 2, DEMOS * FRAMES].map(|frame| texts.get(frame)).into();
+    assert_eq!(found, [Some("reach"), None, Some("grasp"), None, Some("reach"), None]);
 }
 
 #[test]

@@ -609,6 +609,17 @@ fn d4rl_and_its_kind_are_held_to_the_same() {
     assert!(text.contains("walker.hdf5: demo_1: obs/flat: step 3, dimension 1: "), "{text}");
     let report = convert(&path, &set, &skipping(), &mut quiet).unwrap();
     assert_eq!((report.episodes, report.skipped[0].demo.as_str()), (1, "demo_1"));
+    // the whole run is at fault, of which no demo can be left out
+    let file = hdf5::File::open_rw(&path).unwrap();
+    file.unlink("observations").unwrap();
+    file.new_dataset::<f32>().shape([9, 4]).create("observations").unwrap().write_raw(&[0.5_f32; 36]).unwrap();
+    file.close().unwrap();
+    let error = convert(&path, &dir.path().join("no"), &options(), &mut quiet).unwrap_err();
+    assert!(
+        error.to_string().contains("observations: expected 10 steps, as actions has, found shape [9, 4]"),
+        "{error}"
+    );
+    assert!(matches!(error, DatasetError::Input(dataset::InputError::Damaged { .. })));
 }
 
 #[test]

@@ -17,11 +17,22 @@ from __future__ import annotations
 import importlib.util
 import os
 import sys
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 from . import _actrm
-from ._actrm import Batches, Dataset, Error, Policy, Simulator, __version__, leaderboard, load_policy
+from ._actrm import (
+    Batches,
+    Dataset,
+    Error,
+    Policy,
+    ResultsTakenOver,
+    Simulator,
+    __version__,
+    leaderboard,
+    load_policy,
+)
 from ._policies import Called, code, source
 from ._programs import CONTROL, folder
 from ._progress import Progress, teller
@@ -36,6 +47,7 @@ __all__ = [
     "Dataset",
     "Error",
     "Policy",
+    "ResultsTakenOver",
     "Simulator",
     "__version__",
     "convert",
@@ -43,6 +55,9 @@ __all__ = [
     "leaderboard",
     "load_policy",
 ]
+
+# every time, where Python says a text once a line; filters that are there, such as those of `python -W`, come first
+warnings.simplefilter("always", ResultsTakenOver, append=True)
 
 _actrm.set_places(str(folder() / "actrm-data"), str(folder() / CONTROL))
 
@@ -143,14 +158,16 @@ def evaluate(
     """Evaluate a policy in simulation, one episode per seed, as `actrm-zoo eval` does: an entry, or a policy of yours.
 
     The results are stored where the leaderboard finds them. Finished episodes are not run again: an
-    interrupted evaluation resumes, a finished one is returned at once, for a policy of yours with a `RuntimeWarning`.
+    interrupted evaluation resumes, a finished one is returned at once, for a policy of yours with the warning
+    `ResultsTakenOver`.
     The outcome of an episode does not depend on the number of workers.
 
     A policy of yours is a function, or an object with `select_action` or `predict_action_chunk`, and `reset` if it
     remembers anything. It gets a dict of NumPy arrays without a batch axis: float32 numbers, uint8 images (height,
     width, 3). If the environment says what is to be done, that text is under `task`. It returns one action (D,) or a
     chunk (T, D). It is evaluated under `name`, as a new entry of the zoo that says where it comes from and holds no
-    weights. Other settings and another text of its class are another version of the entry.
+    weights. Other settings and other code of its class are another version of the entry. So is the same code in another
+    version of Python, which compiles it in another way.
 
     Parameters
     ----------

@@ -16,6 +16,7 @@ _External = tuple[Called, str, str, str | None, str | None, dict[str, list[str]]
 __version__: str
 
 class Error(Exception): ...
+class ResultsTakenOver(RuntimeWarning): ...
 
 @final
 class Dataset:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import copy
+import functools
 import hashlib
 import inspect
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+import types
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, cast
 
 if TYPE_CHECKING:
     import numpy as np
@@ -15,8 +17,29 @@ if TYPE_CHECKING:
     Observation = dict[str, NDArray[Any]]
 
 
+# what is shown by itself, and never by an address
+CONSTANTS = (bool, int, float, complex, str, bytes, type(None), types.EllipsisType)
+# what counts of other things: of code neither its file nor its lines
+PARTS: dict[type, tuple[str, ...]] = {
+    types.CodeType: (
+        *("co_code", "co_exceptiontable", "co_argcount", "co_posonlyargcount", "co_kwonlyargcount"),
+        *("co_names", "co_varnames", "co_freevars", "co_cellvars", "co_consts"),
+    ),
+    types.FunctionType: ("__code__", "__defaults__", "__kwdefaults__", "__closure__"),
+    property: ("fget", "fset", "fdel"),
+    staticmethod: ("__func__",),
+    classmethod: ("__func__",),
+    slice: ("start", "stop", "step"),
+    functools.cached_property: ("func",),
+    functools.partial: ("func", "args", "keywords"),
+    functools.partialmethod: ("func", "args", "keywords"),
+}
+
+
 def kind_of(policy: Any) -> Any:
-    """A policy's class, or the function that it is."""
+    """A policy's class, or the function that it is; what a `functools.partial` calls."""
+    while isinstance(policy, functools.partial):
+        policy = policy.func  # pyright: ignore[reportUnknownMemberType]
     return policy if hasattr(policy, "__qualname__") else type(policy)  # pyright: ignore[reportUnknownVariableType]
 
 
@@ -27,18 +50,74 @@ def source(policy: Any) -> str:
 
 
 def code(policy: Any) -> str | None:
-    """SHA-256 of the text of its class, where there is one."""
-    kind = kind_of(policy)
+    """SHA-256 of the code that runs when it is asked: of its class and what that inherits, or of a function.
+
+    No file is read: it may have been edited since. Another version of Python compiles to other code.
+    """
+    seen: dict[int, Any] = {}
+    told = running(policy if isinstance(policy, functools.partial) else kind_of(policy), seen)
+    if not any(isinstance(one, types.FunctionType) for one in seen.values()):
+        return None
+    return hashlib.sha256(repr(told).encode()).hexdigest()
+
+
+def running(thing: Any, seen: dict[int, Any]) -> Any:
+    """Code and constants of a thing, as what has the same `repr` in every process.
+
+    `seen`: the functions and classes so far.
+    """
+    if type(thing) in CONSTANTS:
+        return thing
+    if id(thing) in seen:
+        return ("again", list(seen).index(id(thing)))
+    if isinstance(thing, (types.FunctionType, type)):
+        seen[id(thing)] = thing
+    name, parts = type(thing).__name__, list[Any]()
+    if isinstance(thing, frozenset):
+        return ("frozenset", sorted(repr(running(one, seen)) for one in cast("frozenset[Any]", thing)))
+    if isinstance(thing, tuple):
+        parts = list(cast("tuple[Any, ...]", thing))
+    elif isinstance(thing, types.CellType):
+        parts = [contents(thing)]
+    elif isinstance(thing, types.MethodType):
+        parts = [thing.__func__, kind_of(thing.__self__)]
+    elif isinstance(thing, type):
+        parts = [by_name(members(kind)) for kind in thing.__mro__]
+    elif kind := next((kind for kind in PARTS if isinstance(thing, kind)), None):
+        found = [getattr(thing, part) for part in PARTS[kind]]
+        parts = [by_name(cast("dict[str, Any]", part)) if isinstance(part, dict) else part for part in found]
+    else:
+        # what a wrapper of `functools` calls
+        parts = [inspect.getattr_static(thing, "__wrapped__", None)]
+    return (name, [running(part, seen) for part in parts])
+
+
+def by_name(named: Mapping[str, Any]) -> tuple[Any, ...]:
+    """Names and what they name, sorted by name."""
+    return tuple(sorted(named.items()))
+
+
+def contents(cell: types.CellType) -> Any:
+    """What a function has of the variables around it, but classes: its own is one of them."""
     try:
-        text = inspect.getsource(kind)
-    except (OSError, TypeError):
-        # a notebook's classes are in no file; their methods are known
-        try:
-            parts: list[Any] = list(getattr(kind, "__dict__", {}).values())
-            text = "".join(inspect.getsource(part) for part in parts if inspect.isfunction(part))
-        except (OSError, TypeError):
-            return None
-    return hashlib.sha256(text.encode()).hexdigest() if text else None
+        found = cell.cell_contents
+    except ValueError:
+        return None
+    return None if isinstance(found, type) else found
+
+
+def members(kind: type) -> dict[str, Any]:
+    """Methods, constants and inner classes of a class of Python's."""
+    if kind.__module__ == "builtins":
+        return {}
+
+    def counts(name: str, value: Any) -> bool:
+        if isinstance(value, type):
+            return value.__qualname__.startswith(f"{kind.__qualname__}.")
+        # Python's own attributes have the number of a line among them
+        return not name.startswith("__") or hasattr(value, "__get__")
+
+    return {name: value for name, value in vars(kind).items() if counts(name, value)}
 
 
 class Called:

@@ -1,3 +1,4 @@
+use crate::parents::Parents;
 use anyhow::{Result, anyhow, bail};
 use dataset::{
     ActionKind, ConvertOptions, ConvertReport, DatasetError, ImageForm, InputError, NonFinite, RotationForm, Shard,
@@ -234,7 +235,7 @@ fn to_robomimic(args: &Args) -> Result<ExitCode> {
         return super::export::run(&export);
     }
     let nonfinite = args.nonfinite.into();
-    cli::make_parent(&args.out)?;
+    let _parents = Parents::make(&args.out)?;
     let mut screen = cli::Screen::new();
     let options = WriteOptions { gzip: args.gzip };
     let report = dataset::rewrite(&args.source, &args.out, nonfinite, &options, &mut screen.advance("converting"));
@@ -300,7 +301,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     if let Some(shard) = args.shard {
         return convert_shard(args, &options, shard);
     }
-    cli::make_parent(&args.out)?;
+    let _parents = Parents::make(&args.out)?;
     let start = Instant::now();
     let mut screen = cli::Screen::new();
     let report = dataset::convert(&args.source, &args.out, &options, &mut screen.advance("converting"));
@@ -335,7 +336,7 @@ fn convert_shard(args: &Args, options: &ConvertOptions, shard: Shard) -> Result<
         }
         return Ok(ExitCode::SUCCESS);
     }
-    cli::make_parent(&args.out)?;
+    let _parents = Parents::make(&args.out)?;
     let mut screen = cli::Screen::new();
     let mut advance = screen.advance("converting");
     let report = dataset::convert_shard(&args.source, &args.out, options, shard, &mut |done, total| {

@@ -1,3 +1,4 @@
+use crate::parents::Parents;
 use anyhow::Result;
 use dataset::edit::{self, Destination, EditReport, Parts, Renames, Selection};
 use serde_json::{Value, json};
@@ -237,12 +238,12 @@ pub fn run(args: &Args) -> Result<ExitCode> {
             (vec![(sets.result().to_path_buf(), report)], sets.json)
         }
         Operation::Split(split) => {
-            cli::make_parent(&split.out)?;
+            let _parents = Parents::make(&split.out)?;
             let made = edit::split(&split.set, &split.out, &split.parts.parts(), split.seed, &mut advance)?;
             (made.into_iter().map(|(name, report)| (split.out.join(name), report)).collect(), split.json)
         }
         Operation::Merge(merge) => {
-            cli::make_parent(&merge.out)?;
+            let _parents = Parents::make(&merge.out)?;
             let report = edit::merge(&merge.sets, &merge.out, &mut advance)?;
             (vec![(merge.out.clone(), report)], merge.json)
         }

@@ -1,3 +1,4 @@
+use crate::parents::Parents;
 use anyhow::Result;
 use dataset::{ExportReport, WriteOptions};
 use serde_json::json;
@@ -27,7 +28,7 @@ pub struct Args {
 }
 
 pub fn run(args: &Args) -> Result<ExitCode> {
-    cli::make_parent(&args.out)?;
+    let _parents = Parents::make(&args.out)?;
     let mut screen = cli::Screen::new();
     let options = WriteOptions { gzip: args.gzip };
     let report = dataset::export(&args.dir, &args.out, &options, &mut screen.advance("exporting"));

@@ -1,3 +1,4 @@
+use crate::parents::Parents;
 use anyhow::Result;
 use std::ops::ControlFlow;
 use std::path::PathBuf;
@@ -26,7 +27,7 @@ pub struct Args {
 }
 
 pub fn run(args: &Args) -> Result<ExitCode> {
-    cli::make_parent(&args.out)?;
+    let _parents = Parents::make(&args.out)?;
     let start = Instant::now();
     let mut screen = cli::Screen::new();
     let mut advance = screen.advance("merging");

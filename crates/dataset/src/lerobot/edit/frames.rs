@@ -1,12 +1,13 @@
 //! The rows of the data files: carried over in the types that they have, with new numbers, and looked at once on the way
 //! for statistics and digests. Pictures stay the files that they are.
 
+use super::super::chooser::index_columns;
 use super::super::depth;
 use super::super::encode::{ColumnSummary, PartSummary, PictureSummary, add_to_histograms, sample};
 use super::super::export::Rows;
 use super::super::fingerprint::INDEX_COLUMNS;
 use super::super::images;
-use super::super::info::{FILES_PER_FOLDER, Feature};
+use super::super::info::{FILES_PER_FOLDER, Feature, Features};
 use super::super::open::{Dataset, EpisodeMeta};
 use super::super::pictures::image_files;
 use super::super::read::{self, BadColumn};
@@ -126,9 +127,22 @@ fn number_of(tasks: &mut Vec<String>, text: &str) -> usize {
     })
 }
 
+/// Adds the features of index columns that the first set's data files have and its `info.json` does not state.
+pub(super) fn state_index_columns(features: &mut Features, set: &Dataset) -> Result<()> {
+    let path = read::files(set.root(), "data")?.swap_remove(0);
+    let schema = Arc::clone(read::open(&path)?.schema());
+    for column in index_columns() {
+        if features.get(&column.name).is_none() && schema.index_of(&column.name).is_ok() {
+            features.0.push((column.name, column.feature));
+        }
+    }
+    Ok(())
+}
+
 /// The names of the columns of the first set's data files that are written, their schema under the new names, and what the
 /// files tell Hugging Face's `datasets`. What is no feature is left out, unless the tables alone are made anew.
 fn written_as(edit: &Edit<'_>) -> Result<(Vec<String>, SchemaRef, Option<KeyValue>)> {
+    use DataType::{FixedSizeList, LargeList, List};
     let (set, renames) = (&edit.inputs[0].set, edit.renames);
     let path = read::files(set.root(), "data")?.swap_remove(0);
     let builder = read::open(&path)?;
@@ -138,8 +152,18 @@ fn written_as(edit: &Edit<'_>) -> Result<(Vec<String>, SchemaRef, Option<KeyValu
     let fields: Vec<&Arc<Field>> = builder.schema().fields().iter().filter(|f| known(f.name())).collect();
     let names: Vec<String> = fields.iter().map(|f| f.name().clone()).collect();
     let new = |name: &String| known(name).then(|| renames.get(name).unwrap_or(name).clone());
+    let is_list = |field: &Field| matches!(field.data_type(), List(_) | LargeList(_) | FixedSizeList(_, _));
+    let listed = fields.iter().any(|field| is_list(field) && INDEX_COLUMNS.contains(&field.name().as_str()));
     let field = |field: &Arc<Field>| {
+        let mut kind = field.data_type();
+        // one number a row, whose feature LeRobot takes for no list
+        while let (true, List(inner) | LargeList(inner) | FixedSizeList(inner, _)) =
+            (INDEX_COLUMNS.contains(&field.name().as_str()), kind)
+        {
+            kind = inner.data_type();
+        }
         Field::clone(field)
+            .with_data_type(kind.clone())
             .with_name(renames.get(field.name()).unwrap_or(field.name()))
             .with_metadata(std::collections::HashMap::<String, String>::new())
     };
@@ -147,7 +171,7 @@ fn written_as(edit: &Edit<'_>) -> Result<(Vec<String>, SchemaRef, Option<KeyValu
     let pairs = builder.metadata().file_metadata().key_value_metadata();
     let told = pairs.into_iter().flatten().find(|pair| pair.key == "huggingface").cloned();
     let told = match told {
-        Some(pair) if !renames.is_empty() || names.len() < builder.schema().fields().len() => {
+        Some(pair) if listed || !renames.is_empty() || names.len() < builder.schema().fields().len() => {
             renamed_entry(&pair, &new)
         }
         told => told,
@@ -159,8 +183,14 @@ fn written_as(edit: &Edit<'_>) -> Result<(Vec<String>, SchemaRef, Option<KeyValu
 fn renamed_entry(pair: &KeyValue, new: &dyn Fn(&String) -> Option<String>) -> Option<KeyValue> {
     let told: Value = serde_json::from_str(pair.value.as_ref()?).ok()?;
     let columns = told.get("info")?.get("features")?.as_object()?;
+    let flat = |name: &String, mut what: &Value| {
+        while let (true, Some(inner)) = (INDEX_COLUMNS.contains(&name.as_str()), what.get("feature")) {
+            what = inner;
+        }
+        what.clone()
+    };
     let columns: Map<String, Value> =
-        columns.iter().filter_map(|(name, what)| Some((new(name)?, what.clone()))).collect();
+        columns.iter().filter_map(|(name, what)| Some((new(name)?, flat(name, what)))).collect();
     Some(schema::described_as(columns))
 }
 
@@ -173,10 +203,13 @@ fn columns(root: &Path, batch: &RecordBatch, names: &[String], schema: &Schema) 
             wanted: format!("column {name}"),
             found: batch.schema().fields().iter().map(|f| f.name().as_str()).collect::<Vec<_>>().join(", "),
         })?;
-        let array = &with_bytes(root, name, array)?;
+        let mut array = with_bytes(root, name, array)?;
+        if INDEX_COLUMNS.contains(&name.as_str()) {
+            array = read::leaf(&BadColumn { path: &path, name }, &array, array.len(), 1)?;
+        }
         match array.data_type() == field.data_type() {
-            true => Ok(ArrayRef::clone(array)),
-            false => cast(array, field.data_type()).map_err(|e| {
+            true => Ok(array),
+            false => read::cast_all(&array, field.data_type()).map_err(|e| {
                 let found = format!("{}: {e}", array.data_type());
                 BadColumn { path: &path, name }.because(field.data_type().to_string(), found)
             }),
@@ -268,7 +301,7 @@ impl<'a> Seen<'a> {
         let path = self.set.root().join("data");
         let rows = arrays.first().map_or(0, |a| a.len());
         let as_type = |array: &ArrayRef, to: &DataType| {
-            cast(array, to).map_err(|source| DatasetError::Parquet {
+            read::cast_all(array, to).map_err(|source| DatasetError::Parquet {
                 path: path.clone(),
                 operation: "number its rows",
                 source: source.into(),

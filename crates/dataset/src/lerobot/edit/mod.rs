@@ -280,7 +280,8 @@ fn compose(
     advance: &mut dyn FnMut(u64),
 ) -> Result<EditReport> {
     let mut notes: Vec<String> = inputs.iter().flat_map(|input| input.set.notes()).cloned().collect();
-    let features = renamed(agree::features(inputs)?, renames);
+    let mut features = renamed(agree::features(inputs)?, renames);
+    frames::state_index_columns(&mut features, &inputs[0].set)?;
     let edit = Edit { inputs, taken, features, renames, repair, root };
     let first = inputs[0].set.info();
     let (mut films, mut files) = (Vec::new(), Vec::new());

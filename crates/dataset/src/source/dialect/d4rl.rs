@@ -86,13 +86,13 @@ fn flags(file: &Walked, key: &str, steps: usize) -> Result<Vec<bool>, InputError
     }
 }
 
+/// No demo is at fault, so that none can be left out.
 fn wrong_length(file: &Walked, key: &str, steps: usize, found: String) -> InputError {
-    InputError::WrongLength {
+    InputError::Damaged {
         path: file.path.clone(),
-        demo: "the run".to_owned(),
-        key: key.to_owned(),
-        expected: format!("{steps} (the actions)"),
-        found,
+        object: key.to_owned(),
+        operation: "cut the run by".to_owned(),
+        reason: format!("expected {steps} steps, as actions has, found {found}"),
     }
 }
 

@@ -29,6 +29,8 @@ const MAX_BESIDE: u64 = 4096;
 const KEPT: usize = 192 << 20;
 /// Bytes of a JSON file, at most.
 const MAX_JSON: u64 = 1 << 20;
+/// Where the attributes of an array or a group are.
+const ATTRIBUTES: &str = ".zattrs";
 /// Chunks of at most so many bytes are worth reading whole.
 const WHOLE: u64 = 16 << 20;
 
@@ -447,6 +449,11 @@ impl Buffer {
             }
             notes.push(format!("groups below data are not read: {names}"));
         }
+        let others = self.others().map_err(|e| self.damaged("the store", e))?;
+        if !others.is_empty() {
+            let names = super::dialect::list(others.iter().map(String::as_str));
+            notes.push(format!("only the arrays in data and meta/episode_ends are read: left out are {names}"));
+        }
         // a recording whose observations cannot be read is not one without any
         let unread = problems.iter().find(|p: &&Problem| p.key.as_ref().is_some_and(|key| key.starts_with("obs/")));
         if let Some(unread) = unread.filter(|_| !keys.iter().any(|(key, _)| key.starts_with("obs/"))) {
@@ -509,6 +516,32 @@ impl Buffer {
             notes,
             problems,
         })
+    }
+
+    /// What the store has beside the arrays in `data` and `meta/episode_ends`.
+    fn others(&self) -> Result<Vec<String>, String> {
+        let mut others = Vec::new();
+        let mut with_attributes = vec![String::new()];
+        for (group, read) in [("", &["data", "meta"][..]), ("meta", &["episode_ends"]), ("data", &[])] {
+            let full = |name: &String| if group.is_empty() { name.clone() } else { format!("{group}/{name}") };
+            let arrays = self.store.members(group, ".zarray")?;
+            // what is wrong with those in `data` is said where they are read
+            if group != "data" {
+                let groups = self.store.members(group, ".zgroup")?;
+                let unread = arrays.iter().chain(&groups).filter(|name| !read.contains(&name.as_str()));
+                others.extend(unread.map(full));
+            }
+            let known = |name: &&String| read.contains(&name.as_str()) || (group == "data" && arrays.contains(name));
+            with_attributes.extend(self.store.members(group, ATTRIBUTES)?.iter().filter(known).map(full));
+        }
+        for object in with_attributes {
+            let path = if object.is_empty() { ATTRIBUTES.to_owned() } else { format!("{object}/{ATTRIBUTES}") };
+            let text = self.store.get(&path, MAX_JSON)?.unwrap_or_default();
+            if !matches!(serde_json::from_slice(&text), Ok(Value::Object(all)) if all.is_empty()) && !text.is_empty() {
+                others.push(path);
+            }
+        }
+        Ok(others)
     }
 
     /// The step after each episode's last.

@@ -101,7 +101,8 @@ impl Store {
             Self::Zip(archive, above) => {
                 let archive = archive.lock().unwrap_or_else(PoisonError::into_inner);
                 let name = |path: &str| {
-                    let name = path.strip_prefix(above.as_str())?.strip_prefix(group)?.strip_prefix('/')?;
+                    let name = path.strip_prefix(above.as_str())?.strip_prefix(group)?;
+                    let name = if group.is_empty() { name } else { name.strip_prefix('/')? };
                     let name = name.strip_suffix(mark)?.strip_suffix('/')?;
                     (!name.contains('/')).then(|| name.to_owned())
                 };

@@ -63,6 +63,31 @@ fn groups_below_data_are_named() {
 }
 
 #[test]
+fn what_lies_beside_the_steps_is_named() {
+    let (dir, store) = store();
+    for path in ["labels", "meta/lang", "extra/deep"] {
+        array(&store, path, "<f4", &[2], json!(0.0), &[0; 8]);
+    }
+    std::fs::write(store.join("extra/.zgroup"), "{}").unwrap();
+    for (path, text) in [("", r#"{"fps": 10}"#), ("meta", "{}"), ("data/state", r#"{"unit": "m"}"#)] {
+        std::fs::write(store.join(path).join(".zattrs"), text).unwrap();
+    }
+    let expected = "only the arrays in data and meta/episode_ends are read: left out are labels, extra, meta/lang, .zattrs, \
+                    data/state/.zattrs";
+    assert_eq!(Source::open(&store).unwrap().plan().notes, [expected]);
+    // the same in a zip file
+    let path = dir.path().join("some.zip");
+    let mut archive = ZipWriter::new(std::fs::File::create(&path).unwrap());
+    for file in crate::source::zarr::Store::Folder(store.clone()).files(&store) {
+        let name = file.0.strip_prefix(&store).unwrap().display().to_string();
+        archive.start_file(name, SimpleFileOptions::default()).unwrap();
+        archive.write_all(&std::fs::read(&file.0).unwrap()).unwrap();
+    }
+    archive.finish().unwrap();
+    assert_eq!(Source::open(&path).unwrap().plan().notes, [expected]);
+}
+
+#[test]
 fn an_array_that_ends_early_loses_the_episodes_beyond() {
     let (_dir, store) = store();
     array(&store, "data/state", "<f4", &[2, 1], json!(0.0), &[0; 8]);

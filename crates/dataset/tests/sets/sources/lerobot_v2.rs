@@ -4,7 +4,7 @@ use super::{fixture, quiet};
 use crate::common::copy;
 use arrow_array::cast::AsArray;
 use arrow_array::types::{Float32Type, Int64Type};
-use arrow_array::{ArrayRef, Float32Array, RecordBatch};
+use arrow_array::{Array, ArrayRef, FixedSizeListArray, Float32Array, RecordBatch};
 use dataset::edit::{Destination, Selection, keep};
 use dataset::{ConvertOptions, Dataset, NonFinite, OldSet, Source, VideoFile, convert, verify};
 use parquet::arrow::ArrowWriter;
@@ -138,29 +138,53 @@ fn a_count_that_is_wrong_is_noted_and_other_doors_say_what_to_do() {
     assert!(text.contains("--fps is not supported"), "{text}");
 }
 
+/// Changes the times of an episode.
+fn with_times(path: &Path, change: impl Fn(&ArrayRef) -> ArrayRef) {
+    let reader = ParquetRecordBatchReaderBuilder::try_new(File::open(path).unwrap()).unwrap().build().unwrap();
+    for batch in reader.collect::<Vec<_>>() {
+        let batch = batch.unwrap();
+        let schema = batch.schema();
+        let column = |(field, column): (&Arc<arrow_schema::Field>, &ArrayRef)| match field.name().as_str() {
+            "timestamp" => ("timestamp".to_owned(), change(column)),
+            name => (name.to_owned(), Arc::clone(column)),
+        };
+        let changed = schema.fields().iter().zip(batch.columns()).map(column);
+        let changed = RecordBatch::try_from_iter(changed).unwrap();
+        let mut writer = ArrowWriter::try_new(File::create(path).unwrap(), changed.schema(), None).unwrap();
+        writer.write(&changed).unwrap();
+        writer.close().unwrap();
+    }
+}
+
+#[test]
+fn times_may_be_lists_of_one() {
+    let dir = tempfile::tempdir().unwrap();
+    let (old, out) = (dir.path().join("old"), dir.path().join("set"));
+    copy(&fixture("lerobot_v21"), &old);
+    let made = |out: &Path| convert(&old, out, &ConvertOptions::default(), &mut quiet).unwrap().fingerprint;
+    let expected = made(&out);
+    for episode in 0..2 {
+        with_times(&old.join(format!("data/chunk-000/episode_00000{episode}.parquet")), |times| {
+            let kind = Arc::new(arrow_schema::Field::new("element", times.data_type().clone(), false));
+            Arc::new(FixedSizeListArray::new(kind, 1, Arc::clone(times), None))
+        });
+    }
+    assert_eq!(made(&dir.path().join("again")), expected);
+    let data = "data/chunk-000/file-000.parquet";
+    let same = [out.join(data), dir.path().join("again").join(data)].map(|file| {
+        let file = ParquetRecordBatchReaderBuilder::try_new(File::open(file).unwrap()).unwrap();
+        file.schema().field_with_name("timestamp").unwrap().data_type().clone()
+    });
+    assert_eq!(same[0], same[1]);
+}
+
 #[test]
 fn a_column_that_is_not_stated_is_left_out_and_times_are_finite() {
     let dir = tempfile::tempdir().unwrap();
     let old = dir.path().join("old");
     copy(&fixture("lerobot_v21"), &old);
     let path = old.join("data/chunk-000/episode_000001.parquet");
-    let reader = ParquetRecordBatchReaderBuilder::try_new(File::open(&path).unwrap()).unwrap().build().unwrap();
-    for batch in reader.collect::<Vec<_>>() {
-        let batch = batch.unwrap();
-        let schema = batch.schema();
-        let column = |(field, column): (&Arc<arrow_schema::Field>, &ArrayRef)| match field.name().as_str() {
-            "timestamp" => {
-                let times: ArrayRef = Arc::new(Float32Array::from(vec![f32::NAN; batch.num_rows()]));
-                ("timestamp".to_owned(), times)
-            }
-            name => (name.to_owned(), Arc::clone(column)),
-        };
-        let changed = schema.fields().iter().zip(batch.columns()).map(column);
-        let changed = RecordBatch::try_from_iter(changed).unwrap();
-        let mut writer = ArrowWriter::try_new(File::create(&path).unwrap(), changed.schema(), None).unwrap();
-        writer.write(&changed).unwrap();
-        writer.close().unwrap();
-    }
+    with_times(&path, |times| Arc::new(Float32Array::from(vec![f32::NAN; times.len()])));
     let info = std::fs::read(old.join("meta/info.json")).unwrap();
     let mut info: serde_json::Value = serde_json::from_slice(&info).unwrap();
     info["features"].as_object_mut().unwrap().remove("next.done").unwrap();

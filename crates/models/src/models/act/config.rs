@@ -86,7 +86,7 @@ impl Config {
     /// How large the model will be.
     pub fn size(&self) -> Size {
         let (shape, horizon) = (self.shape(), self.action_horizon);
-        let embeddings = Size { weights: 2.0 * horizon as f64 * self.dim_model as f64, activations: 0.0 };
+        let embeddings = Size { weights: horizon as f64 * self.dim_model as f64, activations: 0.0 };
         let vae = if self.use_vae { shape.size(1, horizon) * self.n_vae_encoder_layers } else { Size::default() };
         shape.size(1, 2) * self.n_encoder_layers + shape.size(2, horizon) * self.n_decoder_layers + vae + embeddings
     }

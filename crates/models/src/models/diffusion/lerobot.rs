@@ -162,10 +162,6 @@ pub fn write_config(diffusion: &LerobotDiffusion) -> Result<Value> {
             "LeRobot's UNet, the only network that its diffusion has",
         ));
     }
-    if signature.get(ENVIRONMENT_STATE).is_none() {
-        let expected = "observation.environment_state, without which LeRobot has no diffusion on states";
-        return Err(DIFFUSION.refuse("input_features", "observation.state alone", expected));
-    }
     let own = json!({
         "horizon": c.action_horizon,
         "n_action_steps": diffusion.n_action_steps,
@@ -183,7 +179,13 @@ pub fn write_config(diffusion: &LerobotDiffusion) -> Result<Value> {
         "num_inference_steps": c.inference_steps,
         "do_mask_loss_for_padding": c.mask_padding,
     });
-    DIFFUSION.write_config(signature, &diffusion.modes, own)
+    let written = DIFFUSION.write_config(signature, &diffusion.modes, own)?;
+    // what it cannot read at all is named first
+    if signature.get(ENVIRONMENT_STATE).is_none() {
+        let expected = "observation.environment_state, without which LeRobot has no diffusion on states";
+        return Err(DIFFUSION.refuse("input_features", "observation.state alone", expected));
+    }
+    Ok(written)
 }
 
 /// Loads the tensors of a LeRobot `model.safetensors` into the parameters of a diffusion model: the name set must be exactly
@@ -250,6 +252,8 @@ mod tests {
     fn what_lerobot_cannot_read_is_not_written() {
         let mut entities = example();
         entities.signature.observation.push(FeatureSpec::entity("cube", 3, "cube", false));
+        assert!(write_config(&entities).unwrap_err().to_string().contains("observation.entity.cube of kind entity"));
+        entities.signature.observation.remove(1);
         assert!(write_config(&entities).unwrap_err().to_string().contains("observation.entity.cube of kind entity"));
         let mut alone = example();
         alone.signature.observation.truncate(1);
