@@ -16,7 +16,6 @@ use zoo::ZooError;
 use zoo::conventions::Conventions;
 use zoo::entry::LoadedEntry;
 use zoo::evaluation::acting;
-use zoo::experiment::DataSection;
 use zoo::registry::Registry;
 use zoo::results::Execution;
 
@@ -543,10 +542,9 @@ fn lerobot_checkpoint(path: &Path) -> Option<PathBuf> {
 /// A checkpoint as an entry that nobody keeps.
 fn import_checkpoint(folder: &Path, backend: &Backend) -> Result<LoadedEntry, ZooError> {
     let zoo = tempfile::tempdir().map_err(ZooError::io("create folder", std::env::temp_dir()))?;
-    let DataSection { state_keys, env_keys, .. } = DataSection::default();
     let task = exported_task(folder)?.unwrap_or_else(|| "unknown".to_owned());
     let name = "lerobot-checkpoint".to_owned();
-    let options = ImportOptions { name, task, state_keys, env_keys, fast_render: false };
+    let options = ImportOptions { name, task, state_keys: None, env_keys: None, fast_render: false };
     let id = import(folder, &options, zoo.path())?;
     Registry::open(zoo.path()).entry(&id.to_string())?.load_on(backend)
 }

@@ -132,9 +132,8 @@ pub fn collect(
         if end == RunEnd::Stopped {
             return Ok(CollectEnd::Stopped(good.len()));
         }
-        collection.discard()?;
-        let (successes, wanted) = (good.len(), options.episodes);
-        return Err(RecordingError::TooFewSuccesses { task, successes, attempts, wanted });
+        let (successes, wanted, kept) = (good.len(), options.episodes, attempts_folder(&options.out));
+        return Err(RecordingError::TooFewSuccesses { task, successes, attempts, wanted, kept });
     }
     let env_args = with_rate(record.env_args.clone(), pool.ready().control_freq);
     write(&task, options, &collection, &good, &env_args)?;

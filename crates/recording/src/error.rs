@@ -33,7 +33,8 @@ pub enum RecordingError {
     },
     /// The expert fails too often.
     #[error(
-        "the expert succeeded in {successes} of {attempts} attempts at {task}: too few for {wanted} demos; nothing was written"
+        "the expert succeeded in {successes} of {attempts} attempts at {task}: too few for {wanted} demos; the attempts stay in \
+         {}, and the same command with fewer --episodes takes them up", kept.display()
     )]
     TooFewSuccesses {
         /// The task.
@@ -44,6 +45,8 @@ pub enum RecordingError {
         attempts: u64,
         /// Demonstrations wanted.
         wanted: u64,
+        /// Where the attempts are.
+        kept: PathBuf,
     },
     /// An attempt that was on disk is not there any more.
     #[error("attempt {attempt} of {task} is not on disk any more")]

@@ -106,8 +106,8 @@ struct Shared<'a> {
     stop: &'a Stop,
     ready: Option<&'a Ready>,
     incidents: Mutex<&'a mut Vec<Incident>>,
-    /// Seeds whose episodes hung and have no result, and in which request.
-    hung: Mutex<BTreeMap<u64, &'static str>>,
+    /// Seeds whose episodes hung and have no result, in which request, and on how many workers one after the other.
+    hung: Mutex<BTreeMap<u64, (&'static str, u32)>>,
 }
 
 struct Progress {
@@ -248,8 +248,10 @@ impl Pool {
                     }
                     // what was under way is not done, and nothing has failed
                     Err(JobError::Final(RolloutError::Stopped { .. })) => {}
+                    // nobody needs what was still under way
+                    Err(JobError::Final(_)) if !open => {}
                     Err(JobError::Final(error)) => {
-                        failure.get_or_insert(error);
+                        failure = Some(error);
                         open = false;
                     }
                     Err(JobError::Worker(_)) => unreachable!("attempt turns faults into errors"),
@@ -309,8 +311,12 @@ impl Shared<'_> {
             return None;
         }
         let mut hung = lock(&self.hung);
-        hung.insert(seed, fault.phase);
-        let alike = hung.iter().filter(|(_, phase)| **phase == fault.phase).map(|(seed, _)| *seed);
+        let (phase, times) = hung.entry(seed).or_insert((fault.phase, 0));
+        *times = if *phase == fault.phase { *times + 1 } else { 1 };
+        *phase = fault.phase;
+        // once may be the machine, which stood still for all workers
+        let alike =
+            hung.iter().filter(|(_, (phase, times))| *phase == fault.phase && *times > 1).map(|(seed, _)| *seed);
         let alike: Vec<u64> = alike.collect();
         (alike.len() >= HANGS).then_some(alike)
     }

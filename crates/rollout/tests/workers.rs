@@ -362,7 +362,8 @@ fn images_are_drawn_of_every_step() {
 /// Workers of `tools/harness/tests/odd_simulator.py`, whose tasks are what can be wrong with an environment.
 fn odd(folder: &std::path::Path, task: &str) -> rollout::WorkerSpec {
     let tests = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tools/harness/tests");
-    let body = format!("export PYTHONPATH=\"$PYTHONPATH:{}\"\nexec \"$PY\" \"$@\"", tests.display());
+    let (tests, folder_text) = (tests.display(), folder.display());
+    let body = format!("export PYTHONPATH=\"$PYTHONPATH:{tests}\" ODD_FOLDER=\"{folder_text}\"\nexec \"$PY\" \"$@\"");
     let mut spec = spec(task);
     spec.python = wrapped(folder, task, &body);
     spec.env_module = Some("odd_simulator".to_owned());
@@ -398,9 +399,21 @@ fn an_environment_that_hangs_ends_the_run_after_three_seeds_from_the_first_step_
         assert_eq!((seeds.len(), fault.phase), (3, phase), "{error}");
         assert!(error.to_string().contains("no answer within 1.0 s"), "{error}");
         assert!(results.iter().all(Result::is_err), "no episode has a result");
-        // three workers for each of two seeds, one for the third, and what the other worker had begun meanwhile
+        // three workers for each of two seeds, two for the third, and what the other worker had begun meanwhile
         assert!(pool.incidents().len() < 15, "{:?}", pool.incidents());
     }
+}
+
+#[test]
+fn workers_that_stand_still_together_once_end_nothing() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut spec = odd(dir.path(), "HangsOnce");
+    let limit = Duration::from_secs(1);
+    spec.limits = TimeLimits { step: limit, reset: limit, ..TimeLimits::default() };
+    let mut pool = Pool::start(PoolOptions::new(spec, 4)).unwrap();
+    let (results, end) = stepped(&mut pool, 4);
+    assert_eq!((end.unwrap(), results.len()), (RunEnd::Complete, 4));
+    assert!(results.iter().all(Result::is_ok) && pool.incidents().len() == 4, "{:?}", pool.incidents());
 }
 
 #[test]

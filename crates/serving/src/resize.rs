@@ -6,7 +6,9 @@ pub(crate) fn resize_with_pad(rgb: &[u8], height: usize, width: usize, size: usi
         return rgb.to_vec();
     }
     let ratio = (width as f64 / size as f64).max(height as f64 / size as f64);
-    let (new_height, new_width) = ((height as f64 / ratio) as usize, (width as f64 / ratio) as usize);
+    // of a narrow image, too, something is seen
+    let new = |side: usize| ((side as f64 / ratio) as usize).max(1);
+    let (new_height, new_width) = (new(height), new(width));
     let wide = if new_width == width { rgb.to_vec() } else { columns(rgb, width, new_width) };
     let resized = if new_height == height { wide } else { rows(&wide, height, new_height, new_width) };
     let mut square = vec![0; size * size * 3];

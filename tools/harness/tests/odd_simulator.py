@@ -1,7 +1,9 @@
 """`toy_simulator`'s point, and what can be wrong with an environment: `--env-module odd_simulator --task ODD`."""
 
+import os
 import time
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from toy_simulator import Slide
@@ -16,6 +18,7 @@ class Odd(Slide):
     """What is wrong is the task's name."""
 
     task: str = ""
+    seed: int = 0
 
     def describe(self) -> Description:
         """One without limits and one whose limits are no numbers."""
@@ -27,13 +30,19 @@ class Odd(Slide):
     def reset(self, seed: int, demonstration: bool) -> Initial:
         """One whose resets hang, and one whose description of an episode is no JSON."""
         first = super().reset(seed, demonstration)
+        self.seed = seed
         if self.task == "ResetHangs":
             time.sleep(3600)
         return replace(first, ep_meta={"size": np.nan}) if self.task == "NanMeta" else first
 
     def step(self, actions: Array) -> Stepped:
-        """Rewards and successes that are no numbers, steps that hang."""
-        if self.task == "StepHangs":
+        """Rewards and successes that are no numbers, steps that hang: always, or once a seed."""
+        hangs = self.task == "StepHangs"
+        if self.task == "HangsOnce":
+            mark = Path(os.environ["ODD_FOLDER"]) / str(self.seed)
+            hangs = not mark.exists()
+            mark.touch()
+        if hangs:
             time.sleep(3600)
         done = super().step(actions)
         odd = {
@@ -55,6 +64,7 @@ NAMES = (
     "NanLimit",
     "ResetHangs",
     "StepHangs",
+    "HangsOnce",
     "NanMeta",
     "NanReward",
     "NanSuccess",

@@ -24,13 +24,17 @@ pub(super) struct Step {
     pub state_file: Option<String>,
 }
 
-/// The normalising step's part that matters.
+/// The normalising step.
 #[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub(super) struct NormaliserStep {
     pub eps: f64,
     /// Type and shape by name.
     pub features: Value,
     pub norm_map: BTreeMap<String, String>,
+    /// The only observations that are normalised; all where none are named.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub normalize_observation_keys: Option<Vec<String>>,
 }
 
 /// Reads JSON or says which file is not what it should be.

@@ -52,7 +52,15 @@ pub fn export(entry: &Entry, out: &Path) -> Result<(), ZooError> {
     let device = || step("device_processor", json!({"device": "cpu", "float_dtype": null}));
     let normalise = |name: &str, features: Value, pipeline: &str, index: usize| Step {
         state_file: Some(format!("{pipeline}_step_{index}_{name}.safetensors")),
-        ..step(name, to_json(&NormaliserStep { eps: 1e-8, features, norm_map: norm_map.clone() }))
+        ..step(
+            name,
+            to_json(&NormaliserStep {
+                eps: 1e-8,
+                features,
+                norm_map: norm_map.clone(),
+                normalize_observation_keys: None,
+            }),
+        )
     };
     let before = Pipeline {
         name: PREPROCESSOR.to_owned(),

@@ -6,7 +6,7 @@ use std::path::Path;
 use candle_core::Tensor;
 use models::{
     ACTION, Backend, ENVIRONMENT_STATE, FeatureKind, FeatureSpec, ModelError, NormMode, Normaliser, PolicyConfig,
-    Preprocess, Signature, lerobot,
+    Preprocess, STATE, Signature, lerobot,
 };
 use serde_json::Value;
 
@@ -28,10 +28,10 @@ pub struct ImportOptions {
     pub name: String,
     /// Task that the policy was trained for.
     pub task: String,
-    /// Observation keys that make its state, in order.
-    pub state_keys: Vec<String>,
-    /// Observation keys that make its environment state, in order.
-    pub env_keys: Vec<String>,
+    /// Observation keys that make its state, in order. Where none are given: those of the entry that was exported, or the usual.
+    pub state_keys: Option<Vec<String>>,
+    /// Observation keys that make its environment state, in order; as for the state.
+    pub env_keys: Option<Vec<String>>,
     /// Whether the pictures that it learned from were drawn without reflections and multisampling.
     pub fast_render: bool,
 }
@@ -68,7 +68,11 @@ pub fn import(folder: &Path, options: &ImportOptions, zoo: &Path) -> Result<Entr
                      as LeRobot 0.3 and before wrote them); found neither"
                 ),
             })?;
-            let (path, config) = (config_path.clone(), older::step(&config));
+            let config = older::step(&config).map_err(|e| ZooError::Malformed {
+                path: config_path.clone(),
+                reason: format!("normalization_mapping: expected names of modes: {e}"),
+            })?;
+            let path = config_path.clone();
             let before = Normalising { path: path.clone(), config: config.clone(), statistics: statistics.before };
             (before, Normalising { path, config, statistics: statistics.after })
         }
@@ -84,15 +88,25 @@ pub fn import(folder: &Path, options: &ImportOptions, zoo: &Path) -> Result<Entr
     statistics.retain(|name, _| !name.starts_with(ACTION));
     statistics.extend(after.statistics.into_iter().filter(|(name, _)| name.starts_with(ACTION)));
 
+    let origin = provenance::read(folder)?;
+    let usual = DataSection::default();
     let experiment = Experiment {
         entry: options.name.clone(),
         description: format!("{} imported from a LeRobot checkpoint, for {}.", name_of(policy), options.task),
         task: TaskSection { name: options.task.clone() },
         data: DataSection {
-            state_keys: options.state_keys.clone(),
+            state_keys: keys_of(
+                options.state_keys.as_ref(),
+                origin.as_ref(),
+                (STATE, "--state-keys"),
+                usual.state_keys,
+            )?,
             env_keys: match signature.get(ENVIRONMENT_STATE) {
                 None => Vec::new(),
-                Some(_) => options.env_keys.clone(),
+                Some(_) => {
+                    let named = (ENVIRONMENT_STATE, "--env-keys");
+                    keys_of(options.env_keys.as_ref(), origin.as_ref(), named, usual.env_keys)?
+                }
             },
             n_obs_steps: signature.n_obs_steps,
             cameras: cameras(signature).map_err(config::misfit(&config_path))?,
@@ -122,7 +136,6 @@ pub fn import(folder: &Path, options: &ImportOptions, zoo: &Path) -> Result<Entr
 
     let statistics = preprocess.normaliser().tensors().map_err(experiment.model_error("store the normaliser of"))?;
     let about = serde_json::json!({"format": 1, "policy": experiment.policy_type()});
-    let origin = provenance::read(folder)?;
     if let Some(origin) = origin.as_ref().filter(|origin| origin.task != options.task) {
         return Err(ZooError::InvalidValue {
             key: "--task".to_owned(),
@@ -172,6 +185,25 @@ pub fn import(folder: &Path, options: &ImportOptions, zoo: &Path) -> Result<Entr
         normaliser: tensors::to_bytes(&model_path, &statistics, &serde_json::json!({"format": 1}))?,
     };
     draft.seal(zoo)
+}
+
+/// The keys of a feature: those that were asked for, which must be those of the entry that was exported, if it was one.
+fn keys_of(
+    asked: Option<&Vec<String>>,
+    origin: Option<&EntryMeta>,
+    (feature, option): (&str, &str),
+    usual: Vec<String>,
+) -> Result<Vec<String>, ZooError> {
+    let known = origin.map(|origin| origin.keys.of(feature)).filter(|keys| !keys.is_empty());
+    match (asked, known) {
+        (Some(asked), Some(known)) if *asked != known => Err(ZooError::InvalidValue {
+            key: option.to_owned(),
+            expected: format!("{}, which the entry reads that was exported", known.join(",")),
+            found: asked.join(","),
+        }),
+        (Some(asked), _) => Ok(asked.clone()),
+        (None, known) => Ok(known.unwrap_or(usual)),
+    }
 }
 
 /// Whether LeRobot wrote the checkpoint before it had processors.
@@ -232,6 +264,9 @@ impl Normalising {
     }
 }
 
+/// Steps that leave numbers as they are: another step would change what the network reads or what becomes of its actions.
+const PASSING: [&str; 3] = ["rename_observations_processor", "to_batch_processor", "device_processor"];
+
 fn step(folder: &Path, name: &str, registry_name: &str) -> Result<Normalising, ZooError> {
     let path = folder.join(format!("{name}.json"));
     let malformed = |reason: String| ZooError::Malformed { path: path.clone(), reason };
@@ -241,12 +276,21 @@ fn step(folder: &Path, name: &str, registry_name: &str) -> Result<Normalising, Z
         if renames {
             return Err(malformed("rename_map: expected no renamed observations".to_owned()));
         }
+        let off = step.config.get("enabled").and_then(Value::as_bool) == Some(false);
+        if step.registry_name != registry_name && !PASSING.contains(&step.registry_name.as_str()) && !off {
+            let expected = format!("{registry_name}, {}, or a step with `enabled` false", PASSING.join(", "));
+            return Err(malformed(format!("step `{}`: expected {expected}", step.registry_name)));
+        }
     }
     let known: Vec<String> = pipeline.steps.iter().map(|s| s.registry_name.clone()).collect();
     let step = pipeline.steps.into_iter().find(|s| s.registry_name == registry_name);
     let step = step.ok_or_else(|| malformed(format!("no step `{registry_name}`; steps: {}", known.join(", "))))?;
     let config: NormaliserStep =
         serde_json::from_value(step.config).map_err(|e| malformed(format!("step `{registry_name}`: {e}")))?;
+    if let Some(only) = &config.normalize_observation_keys {
+        let found = only.join(", ");
+        return Err(malformed(format!("normalize_observation_keys: expected none, so that all are, found {found}")));
+    }
     if config.eps != 1e-8 {
         return Err(malformed(format!("eps: expected 1e-8, found {:e}", config.eps)));
     }

@@ -42,13 +42,16 @@ pub(super) fn take(weights: &mut BTreeMap<String, Tensor>, signature: &Signature
 }
 
 /// The normalising step that such a checkpoint's `config.json` stands for.
-pub(super) fn step(config: &Value) -> NormaliserStep {
+///
+/// # Errors
+/// A `normalization_mapping` that is none.
+pub(super) fn step(config: &Value) -> Result<NormaliserStep, serde_json::Error> {
     let mapping = config.get("normalization_mapping").filter(|mapping| !mapping.is_null()).cloned();
     // LeRobot's defaults
     let default = match config.get("type").and_then(Value::as_str) {
         Some("diffusion") => json!({"VISUAL": "MEAN_STD", "STATE": "MIN_MAX", "ACTION": "MIN_MAX"}),
         _ => json!({"VISUAL": "MEAN_STD", "STATE": "MEAN_STD", "ACTION": "MEAN_STD"}),
     };
-    let norm_map = serde_json::from_value(mapping.unwrap_or(default)).unwrap_or_default();
-    NormaliserStep { eps: 1e-8, features: Value::Null, norm_map }
+    let norm_map = serde_json::from_value(mapping.unwrap_or(default))?;
+    Ok(NormaliserStep { eps: 1e-8, features: Value::Null, norm_map, normalize_observation_keys: None })
 }

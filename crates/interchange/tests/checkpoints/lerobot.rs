@@ -19,8 +19,8 @@ fn options() -> ImportOptions {
     ImportOptions {
         name: "imported".to_owned(),
         task: "Lift".to_owned(),
-        state_keys: ["robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos"].map(str::to_owned).to_vec(),
-        env_keys: vec!["object".to_owned()],
+        state_keys: None,
+        env_keys: None,
         fast_render: false,
     }
 }
@@ -110,6 +110,35 @@ fn an_entry_that_went_out_and_in_still_says_what_it_was_trained_on() {
     let other_task = ImportOptions { task: "Stack".to_owned(), ..options() };
     let error = import(&out, &other_task, &zoo).unwrap_err().to_string();
     assert!(error.contains("--task") && error.contains("Lift"), "{error}");
+    assert_eq!(after.keys, before.keys);
+    let turned = ImportOptions { state_keys: Some(vec!["robot0_gripper_qpos".to_owned()]), ..options() };
+    let error = import(&out, &turned, &zoo).unwrap_err().to_string();
+    assert!(error.contains("--state-keys") && error.contains("found robot0_gripper_qpos"), "{error}");
+    // another step before the network changes what it reads
+    let processor = out.join("policy_preprocessor.json");
+    let plain = fs::read_to_string(&processor).unwrap();
+    let mut steps: serde_json::Value = serde_json::from_str(&plain).unwrap();
+    for (change, word) in
+        [("relative_actions_processor", "relative_actions_processor"), ("", "normalize_observation_keys")]
+    {
+        let mut changed = steps.clone();
+        let all = changed["steps"].as_array_mut().unwrap();
+        match change {
+            "" => {
+                let step = all.iter_mut().find(|step| step["registry_name"] == "normalizer_processor").unwrap();
+                step["config"]["normalize_observation_keys"] = serde_json::json!(["observation.state"]);
+            }
+            name => all.push(serde_json::json!({"registry_name": name, "config": {"enabled": true}})),
+        }
+        fs::write(&processor, changed.to_string()).unwrap();
+        let error = import(&out, &options(), &zoo).unwrap_err().to_string();
+        assert!(error.contains(word), "{error}");
+    }
+    let off = serde_json::json!({"registry_name": "relative_actions_processor", "config": {"enabled": false}});
+    steps["steps"].as_array_mut().unwrap().push(off);
+    fs::write(&processor, steps.to_string()).unwrap();
+    import(&out, &options(), &zoo).unwrap();
+    fs::write(&processor, plain).unwrap();
     // trained further elsewhere: the weights are others, and of other origin
     let model = out.join("model.safetensors");
     let mut bytes = fs::read(&model).unwrap();

@@ -123,7 +123,7 @@ impl Library {
             return Ok((name.clone(), rest));
         }
         let of_name = match &name {
-            Some(name) => Some(self.parts(name)?.ok_or_else(|| self.unknown(name))?),
+            Some(name) => Some(self.changeable_parts(name, words)?),
             None => None,
         };
         let missing = |key: &str| ZooError::InvalidValue {
@@ -151,6 +151,26 @@ impl Library {
             }
         }
         Ok((name, rest))
+    }
+
+    /// The parts of experiment `name`, of which `words` change some.
+    ///
+    /// # Errors
+    /// An unknown experiment; one of a file of its own, whose settings another combination would not have.
+    fn changeable_parts(&self, name: &str, words: &[String]) -> Result<Parts, ZooError> {
+        let parts = self.parts(name)?;
+        let is_own = self.folder.is_some() && self.file(name)?.is_some();
+        let is_recipe = parts.is_none() && self.file(&format!("recipe/{name}"))?.is_some();
+        let change =
+            words.iter().find(|word| ["policy=", "task=", "inputs="].iter().any(|part| word.starts_with(part)));
+        match (parts, change) {
+            (_, Some(change)) if is_own || is_recipe => Err(ZooError::InvalidValue {
+                key: change.split('=').next().unwrap_or_default().to_owned(),
+                expected: format!("none beside {name}, a file whose settings are for its own policy, task and inputs"),
+                found: change.clone(),
+            }),
+            (parts, _) => parts.ok_or_else(|| self.unknown(name)),
+        }
     }
 
     /// Names of the policies that experiments are made of, sorted.
@@ -252,8 +272,31 @@ impl Library {
         for below in names_in(&mut table, "extends")? {
             self.layers_below(group, &below, chain, into)?;
         }
+        // a puzzle's name models
+        if group != "puzzle" {
+            self.check_combinations(&path, &table)?;
+        }
         into.push((name.to_owned(), table));
         chain.pop();
+        Ok(())
+    }
+
+    /// Checks that every `[for.KEY]` of a task's or a policy's file names something.
+    fn check_combinations(&self, path: &str, table: &Table) -> Result<(), ZooError> {
+        let Some(all) = table.get("for").and_then(Value::as_table) else { return Ok(()) };
+        let (mut known, tasks) = (self.group("inputs")?, self.group("task")?);
+        for key in all.keys() {
+            let combined = longest(&tasks, key).is_some_and(|(_, rest)| known.iter().any(|inputs| inputs == rest));
+            if !combined && !known.contains(key) && !tasks.contains(key) && key != STATE {
+                known.extend(tasks);
+                let hint = nearest(key, &known).map_or(String::new(), |near| format!(" (did you mean `{near}`?)"));
+                return Err(ZooError::InvalidValue {
+                    key: format!("{path}: for.{key}"),
+                    expected: "inputs, a task, or a task and inputs such as stack_image".to_owned(),
+                    found: format!("`{key}`{hint}"),
+                });
+            }
+        }
         Ok(())
     }
 

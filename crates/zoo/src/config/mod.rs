@@ -243,6 +243,16 @@ mod tests {
     }
 
     #[test]
+    fn settings_that_would_be_lost_are_refused() {
+        let (_folder, library) =
+            library(&[("act_lift", "extends = 'bc_lift'"), ("task/here", "[for.imgae.train]\nsteps = 7")]);
+        let error = library.choose(&["act_lift".to_owned(), "inputs=image".to_owned()]).unwrap_err().to_string();
+        assert!(error.starts_with("key `inputs`: expected none beside act_lift, a file"), "{error}");
+        let error = library.resolve("act_here").unwrap_err().to_string();
+        assert!(error.contains("`task/here: for.imgae`") && error.contains("did you mean `image`?"), "{error}");
+    }
+
+    #[test]
     fn every_file_of_configs_is_built_in() {
         fn below(folder: &Path, group: &str, into: &mut Vec<(String, String)>) {
             for item in std::fs::read_dir(folder).unwrap() {

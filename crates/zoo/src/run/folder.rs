@@ -10,6 +10,10 @@ use crate::files::sweep;
 pub const COMMAND_FILE: &str = "command.txt";
 /// Held by the training that works there.
 const LOCK: &str = "lock";
+/// The command that trains what is trained there.
+const BEGUN: &str = "begun.txt";
+/// What the run stands on.
+pub(super) const NOTE: &str = "run.json";
 /// The resolved experiment.
 const CONFIG: &str = "config.toml";
 
@@ -113,9 +117,11 @@ impl RunFolder {
     /// stay, and so does the folder then.
     pub(super) fn discard(&self) {
         // whatever cannot be removed is not worth hiding the error that led here
-        let _ = fs::remove_file(self.path.join(LOCK));
-        let _ = fs::remove_file(self.begun_path());
         let _ = fs::remove_dir_all(self.path.join(super::data::CONVERTED));
+        // the lock last: it says that the others are ours
+        for name in [BEGUN, NOTE, COMMAND_FILE, LOCK] {
+            let _ = fs::remove_file(self.path.join(name));
+        }
         for folder in self.path.ancestors().take(3) {
             if fs::remove_dir(folder).is_err() {
                 return;
@@ -145,7 +151,7 @@ impl RunFolder {
 
     /// The command that trains what is trained here, if the run was begun by one.
     pub(super) fn begun_path(&self) -> PathBuf {
-        self.path.join("begun.txt")
+        self.path.join(BEGUN)
     }
 
     /// What is written there.

@@ -5,8 +5,10 @@ use std::path::Path;
 
 use candle_core::Tensor;
 
+use crate::FeatureKeys;
 use crate::conventions::Conventions;
 use crate::entry::{Entry, EntryId, EntryRequest, MODEL_FILE, ParentMeta};
+use crate::experiment::IMAGE_PREFIX;
 use crate::{ZooError, tensors};
 
 /// Weights that a training begins with.
@@ -14,6 +16,7 @@ pub(super) struct InitialWeights {
     /// The entry that they are of.
     pub parent: ParentMeta,
     conventions: Conventions,
+    keys: FeatureKeys,
     weights: BTreeMap<String, Tensor>,
 }
 
@@ -36,7 +39,7 @@ impl InitialWeights {
         let (weights, _) = tensors::read(&path)?;
         let weights = tensors::in_f32(&path, weights)?;
         let parent = ParentMeta { entry: entry.id().to_string(), content_sha256: entry.meta().content_sha256() };
-        Ok(Self { parent, conventions: entry.conventions()?, weights })
+        Ok(Self { parent, conventions: entry.conventions()?, keys: entry.meta().keys.clone(), weights })
     }
 
     /// Compares the conventions that the weights were trained by with those of demonstrations called `name`.
@@ -59,11 +62,11 @@ impl InitialWeights {
         own.iter().map(begun).collect()
     }
 
-    /// What was taken, what is new and what is not used, for whoever trains.
+    /// What was taken, what is new, what is not used, and which features, of `keys` now, were made of others, for whoever trains.
     ///
     /// # Errors
     /// [`ZooError::InvalidValue`] where nothing was taken: it is another kind of policy.
-    pub fn note(&self, own: &BTreeMap<String, Tensor>) -> Result<String, ZooError> {
+    pub fn note(&self, own: &BTreeMap<String, Tensor>, keys: &FeatureKeys) -> Result<String, ZooError> {
         let new: Vec<&String> = own.iter().filter(|(name, own)| self.of(name, own).is_none()).map(|(n, _)| n).collect();
         let unused = self.weights.keys().filter(|name| own.get(*name).is_none_or(|own| self.of(name, own).is_none()));
         let unused: Vec<&String> = unused.collect();
@@ -80,6 +83,12 @@ impl InitialWeights {
         }
         if !unused.is_empty() {
             note.push_str(&format!("; not used: {}", names(&unused)));
+        }
+        for feature in keys.features().filter(|feature| !feature.starts_with(IMAGE_PREFIX)) {
+            let (there, here) = (self.keys.of(feature), keys.of(feature));
+            if !there.is_empty() && there != here {
+                note.push_str(&format!("; {feature} was {} there, is {} here", there.join(", "), here.join(", ")));
+            }
         }
         Ok(note)
     }

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use dataset::WindowBatch;
-use models::{ACTION, Backend, Observation, Values};
+use models::{ACTION, Backend, Observation, PolicyConfig, Values};
 use serde::Serialize;
 
 use crate::ZooError;
@@ -113,6 +113,14 @@ pub fn score(request: &ScoreRequest<'_>) -> Result<Score, ZooError> {
     let trained = meta.data.as_ref().and_then(|data| data.train_fingerprint.as_ref());
     if trained == demonstrations.meta.train_fingerprint.as_ref() && trained.is_some() {
         notes.push(format!("entry {id} was trained on these episodes"));
+    } else if meta.data.as_ref().is_some_and(|data| data.fingerprint == dataset.fingerprint()) {
+        let all = || (0..dataset.episodes().len()).collect::<Vec<_>>();
+        let of = |mask: &str| dataset.split(mask).unwrap_or_else(all);
+        let (learned, asked) = (of(&loaded.experiment().data.train_mask), of(mask.as_deref().unwrap_or_default()));
+        let both = asked.iter().filter(|episode| learned.contains(episode)).count();
+        if both > 0 {
+            notes.push(format!("entry {id} was trained on {both} of these {} episodes", asked.len()));
+        }
     }
     let past = experiment.policy.past_actions(experiment.data.n_obs_steps);
     let (horizon, dim) = (windows.action_horizon() - past, windows.action_dim());
@@ -123,6 +131,8 @@ pub fn score(request: &ScoreRequest<'_>) -> Result<Score, ZooError> {
     let indices: Vec<u32> = (0..windows.len()).step_by(stride).map(|at| at as u32).collect();
     let (mut sums, mut counts) = (vec![vec![0.0; dim]; horizon], vec![0_u64; horizon]);
     let mut policy = loaded.policy();
+    // what a query leaves behind is all that it knows of the past
+    let carries = matches!(experiment.policy, PolicyConfig::BcRnn(_));
     let mut batch = WindowBatch::default();
     for chunk in indices.chunks(BATCH) {
         windows.try_gather(chunk, &mut batch).map_err(unreadable(&demonstrations.meta.name))?;
@@ -130,7 +140,12 @@ pub fn score(request: &ScoreRequest<'_>) -> Result<Score, ZooError> {
             policy.reset(0);
             let failed = |source| loaded.failed("ask", source);
             let last = batch.n_obs_steps - 1;
-            (0..last).for_each(|step| policy.observe(&observation(&batch, at, step)));
+            for seen in (0..last).map(|step| observation(&batch, at, step)) {
+                match carries {
+                    true => drop(policy.predict(&seen).map_err(failed)?),
+                    false => policy.observe(&seen),
+                }
+            }
             let predicted = policy.predict(&observation(&batch, at, last)).map_err(failed)?;
             let first = at * (past + horizon) + past;
             for step in (0..horizon.min(predicted.action_horizon)).filter(|step| !batch.is_pad[first + step]) {

@@ -168,7 +168,7 @@ impl PolicyTraining {
         on_event: &mut dyn FnMut(TrainEvent<'_>),
     ) -> Result<Self, ZooError> {
         let experiment = &request.experiment;
-        let note_path = folder.path().join("run.json");
+        let note_path = folder.path().join(super::folder::NOTE);
         let earlier = begun(&note_path, folder, request)?;
         let wanted = match (&request.data, &earlier) {
             (Some(path), _) => path.clone(),
@@ -229,7 +229,7 @@ impl PolicyTraining {
             .map_err(experiment.model_error("set up the training of"))?;
         let evaluated = build()?;
         if let Some(initial) = &initial {
-            on_event(TrainEvent::Note(&initial.note(&evaluated.params().tensors())?));
+            on_event(TrainEvent::Note(&initial.note(&evaluated.params().tensors(), &experiment.data.feature_keys()?)?));
         }
         if earlier.is_none() {
             let (experiment, fingerprint) = (request.name.clone(), dataset.fingerprint().to_owned());

@@ -50,7 +50,7 @@ impl Transform for GridPath {
         let slices = source.slices(self.name())?.alike(&format!("data.grids.{name}.visited"), &items)?;
         let mut visited = vec![0; source.windows.len() * cells];
         let mut batch = WindowBatch::default();
-        for episode in source.windows.episodes() {
+        for episode in source.demonstrations(self.name())? {
             let all: Vec<u32> = episode.clone().collect();
             source.gather(&all, &mut batch)?;
             mark(&slices, &batch, &mut visited[episode.start as usize * cells..][..all.len() * cells]);

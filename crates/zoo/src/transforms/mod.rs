@@ -19,7 +19,7 @@ use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use candle_core::Tensor;
-use dataset::{Dataset, DatasetError, WindowBatch, WindowSpec, Windows};
+use dataset::{Dataset, DatasetError, MISTAKE, WindowBatch, WindowSpec, Windows};
 use models::{Batch, ENTITY_PREFIX, ModelError, Signature};
 use serde::{Deserialize, Serialize};
 
@@ -199,6 +199,22 @@ impl Source<'_> {
     /// The places of all items in the data set's columns, for the transform of this name.
     fn slices(&self, name: &str) -> Result<Slices, ZooError> {
         Slices::new(self.experiment, self.dataset, self.path, &format!("data.{name}"))
+    }
+
+    /// The windows of each demonstration, for the transform of this name, which needs demonstrations as a whole.
+    ///
+    /// # Errors
+    /// Marked mistakes that are not learned: windows are those of the stretches between them.
+    fn demonstrations(&self, name: &str) -> Result<Vec<Range<u32>>, ZooError> {
+        let marked = self.dataset.column(MISTAKE).is_some_and(|marks| marks.data.iter().any(|mark| *mark != 0.0));
+        if marked && !self.experiment.data.mistakes {
+            let reason = format!(
+                "data.{name}: expected demonstrations as a whole, found marked mistakes, between which they are read; set \
+                 data.mistakes=true"
+            );
+            return Err(ZooError::UnfitData { path: self.path.to_owned(), reason });
+        }
+        Ok(self.windows.episodes())
     }
 
     /// The windows of these numbers.

@@ -67,27 +67,55 @@ impl Slices {
         Ok(Self { path: path.to_owned(), spans })
     }
 
-    /// The slices of `items`, all of them equally long, in their order; an item of several features stands in each.
+    /// What is wrong with the items under `key`.
+    pub fn unfit(&self, key: &str, reason: String) -> ZooError {
+        ZooError::UnfitData { path: self.path.clone(), reason: format!("{key}: {reason}") }
+    }
+
+    /// The slices of `items`, all of them equally long, in their order.
+    ///
+    /// # Errors
+    /// As [`Slices::of_each`].
+    pub fn alike(&self, key: &str, items: &[String]) -> Result<Vec<Slice>, ZooError> {
+        Ok(self.of_each(key, items)?.concat())
+    }
+
+    /// The slices of each of `items`, all of them equally long: an item of several features stands in each.
     ///
     /// # Errors
     /// An item that stands nowhere, items of unequal lengths, by name and under `key`.
-    pub fn alike(&self, key: &str, items: &[String]) -> Result<Vec<Slice>, ZooError> {
-        let unfit =
-            |reason: String| ZooError::UnfitData { path: self.path.clone(), reason: format!("{key}: {reason}") };
-        let mut slices: Vec<Slice> = Vec::new();
+    pub fn of_each(&self, key: &str, items: &[String]) -> Result<Vec<Vec<Slice>>, ZooError> {
+        let unfit = |reason| self.unfit(key, reason);
+        let mut all: Vec<Vec<Slice>> = Vec::with_capacity(items.len());
         for item in items {
-            let here: Vec<&Slice> =
-                self.spans.iter().filter(|(text, _)| text == item).map(|(_, slice)| slice).collect();
-            if here.is_empty() {
-                return Err(unfit(format!("{item} is an item of no feature")));
+            let here: Vec<Slice> =
+                self.spans.iter().filter(|(text, _)| text == item).map(|(_, slice)| slice.clone()).collect();
+            let Some(slice) = here.first() else { return Err(unfit(format!("{item} is an item of no feature"))) };
+            if let Some(first) = all.first().map(|first| &first[0]).filter(|first| first.width != slice.width) {
+                return Err(unfit(format!("{item} has {} numbers, {} has {}", slice.width, items[0], first.width)));
             }
-            for slice in here {
-                if let Some(first) = slices.first().filter(|first| first.width != slice.width) {
-                    return Err(unfit(format!("{item} has {} numbers, {} has {}", slice.width, items[0], first.width)));
-                }
-                slices.push(slice.clone());
-            }
+            all.push(here);
         }
-        Ok(slices)
+        Ok(all)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    #[test]
+    fn an_item_of_two_features_has_a_slice_in_each() {
+        let slice = |feature: &str, from| Slice { feature: feature.to_owned(), from, width: 3 };
+        let spans = [("a", "all", 0), ("b", "all", 3), ("a", "one", 0), ("b", "two", 0)];
+        let spans = spans.map(|(item, feature, from)| (item.to_owned(), slice(feature, from))).into();
+        let slices = Slices { path: PathBuf::new(), spans };
+        let items = ["a", "b"].map(str::to_owned);
+        let each = slices.of_each("key", &items).unwrap();
+        assert_eq!(each, [[slice("all", 0), slice("one", 0)], [slice("all", 3), slice("two", 0)]]);
+        assert_eq!(slices.alike("key", &items).unwrap(), each.concat());
+        let error = slices.of_each("key", &["c".to_owned()]).unwrap_err().to_string();
+        assert!(error.contains("key: c is an item of no feature"), "{error}");
     }
 }

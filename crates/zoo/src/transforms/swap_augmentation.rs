@@ -20,7 +20,7 @@
 
 use dataset::WindowBatch;
 use dataset::shuffle::SplitMix64;
-use models::{Batch, ModelError, Taken};
+use models::{Batch, ENTITY_PREFIX, ModelError, Taken};
 use serde::{Deserialize, Serialize};
 
 use super::slices::{Slice, Slices};
@@ -121,7 +121,12 @@ impl Transform for SwapAugmentation {
         let slices = source.slices(self.name())?;
         let (mut all, mut pointer) = (Vec::new(), None);
         for (name, section) in &experiment.data.exchange {
-            let from_hand = slices.alike(&format!("data.exchange.{name}.taken"), &section.taken)?;
+            let from_hand = slices.of_each(&format!("data.exchange.{name}.taken"), &section.taken)?;
+            // whichever feature has it: the pointer's entities before others
+            let of_pointer =
+                |slice: &&Slice| pointed(experiment) == Some(name.as_str()) && slice.feature.starts_with(ENTITY_PREFIX);
+            let from_hand: Vec<Slice> =
+                from_hand.iter().map(|found| found.iter().find(of_pointer).unwrap_or(&found[0]).clone()).collect();
             let objects = of_objects(&slices, &format!("data.exchange.{name}.items"), &section.items)?;
             let moved = of_objects(&slices, &format!("data.exchange.{name}.places"), &section.places)?;
             if pointed(experiment) == Some(name.as_str()) {
@@ -272,8 +277,15 @@ fn of_objects(slices: &Slices, key: &str, items: &[Vec<String>]) -> Result<Vec<V
     let mut objects = vec![Vec::new(); items.len()];
     for at in 0..items.first().map_or(0, Vec::len) {
         let alike: Vec<String> = items.iter().map(|object| object[at].clone()).collect();
-        for (object, slice) in objects.iter_mut().zip(slices.alike(key, &alike)?) {
-            object.push(slice);
+        let found = slices.of_each(key, &alike)?;
+        if let Some(other) = (0..found.len()).find(|object| found[*object].len() != found[0].len()) {
+            let (first, other) = ((&alike[0], found[0].len()), (&alike[other], found[other].len()));
+            return Err(
+                slices.unfit(key, format!("{} is in {} features, {} in {}", first.0, first.1, other.0, other.1))
+            );
+        }
+        for (object, found) in objects.iter_mut().zip(found) {
+            object.extend(found);
         }
     }
     Ok(objects)
@@ -294,7 +306,7 @@ fn episodes(from_hand: &[Slice], moved: &[Vec<Slice>], source: &Source<'_>) -> R
         let taken = nearest.unwrap_or(0);
         Ok(Episode { end: range.end, taken, others: there().filter(|object| *object != taken).collect(), beginning })
     };
-    source.windows.episodes().into_iter().map(episode).collect()
+    source.demonstrations("exchange")?.into_iter().map(episode).collect()
 }
 
 #[cfg(test)]

@@ -76,7 +76,9 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let part = |job: u64| job as usize * PART..steps.min((job as usize + 1) * PART);
     let work = |(): &mut (), worker: &mut Worker, job: u64| {
         let Recording { model, ep_meta, states, actions } = &recording;
-        let cut = |tensor: &FrameTensor| slice(tensor, part(job));
+        // and the next part's first, which is looked at as it was recorded: what follows the last is simulated
+        let rows = part(job).start..steps.min(part(job).end + 1);
+        let cut = |tensor: &FrameTensor| slice(tensor, rows.clone());
         Ok(worker.extract(model, ep_meta, cut(states), cut(actions))?)
     };
     let (mut success, mut images) = (false, 0);
@@ -85,7 +87,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         let last = job + 1 == parts as u64;
         let failed = |error| anyhow::Error::from(recording::replay_error(&args.input, &id, &ready, error));
         let drawn = result.map_err(failed).and_then(|episode| {
-            success |= episode.success;
+            success |= if last { episode.success } else { solved(&episode) };
             let drawn = pictures(&args.camera, size, &episode, last);
             let drawn = drawn.with_context(|| format!("{}: {id}", args.input.display()))?;
             drawn.iter().try_for_each(|image| video.push(image))?;
@@ -167,7 +169,14 @@ fn slice(tensor: &FrameTensor, rows: Range<usize>) -> FrameTensor {
     FrameTensor { dtype: tensor.dtype, shape, bytes: tensor.bytes[rows.start * width..rows.end * width].to_vec() }
 }
 
-/// The images of a part; of the last one also what the last action led to.
+/// Whether the task was solved in a part, whose last step is simulated and does not count.
+fn solved(episode: &RecordedEpisode) -> bool {
+    let dones = episode.tensors.get("dones").map_or(&[][..], |dones| dones.bytes.as_slice());
+    let (dones, _) = dones.as_chunks();
+    dones.split_last().is_some_and(|(_, looked_at)| looked_at.iter().any(|done| i64::from_le_bytes(*done) != 0))
+}
+
+/// The images of a part; of the last one also what the last action led to, of others without the next one's first.
 fn pictures(camera: &str, size: (usize, usize), episode: &RecordedEpisode, last: bool) -> Result<Vec<Image>> {
     let (height, width) = size;
     let take = |group: &str| {
@@ -184,8 +193,9 @@ fn pictures(camera: &str, size: (usize, usize), episode: &RecordedEpisode, last:
     };
     let image = |rgb: &[u8]| Image { height, width, rgb: rgb.to_vec() };
     let mut images: Vec<Image> = take("obs")?.map(image).collect();
-    if last {
-        images.extend(take("next_obs")?.next_back().map(image));
+    match last {
+        true => images.extend(take("next_obs")?.next_back().map(image)),
+        false => drop(images.pop()),
     }
     Ok(images)
 }
@@ -199,5 +209,17 @@ mod tests {
         let whole = FrameTensor::from_f64(&[3, 2], &[0.0, 1.0, 2.0, 3.0, 4.0, 5.0]);
         assert_eq!(slice(&whole, 1..3), FrameTensor::from_f64(&[2, 2], &[2.0, 3.0, 4.0, 5.0]));
         assert_eq!(slice(&whole, 0..0).shape, [0, 2]);
+    }
+
+    /// The last step of a part is the simulator's, not the recording's.
+    #[test]
+    fn a_part_is_solved_where_a_recorded_state_is() {
+        let part = |dones: [i64; 3]| {
+            let bytes = dones.iter().flat_map(|done| done.to_le_bytes()).collect();
+            let dones = FrameTensor { dtype: Dtype::I64, shape: vec![3], bytes };
+            let tensors = [("dones".to_owned(), dones)].into();
+            RecordedEpisode { success: true, steps: 3, attrs: Default::default(), tensors }
+        };
+        assert!(solved(&part([0, 1, 1])) && !solved(&part([0, 0, 1])));
     }
 }

@@ -3,6 +3,7 @@ use std::process::ExitCode;
 
 use cli::shown;
 use interchange::{lerobot, robomimic};
+use zoo::experiment::DataSection;
 
 use crate::places::ZooArgs;
 
@@ -31,17 +32,13 @@ struct NamedArgs {
     /// Task that the policy was trained for
     #[arg(long)]
     task: String,
-    /// Observation keys of the robot state, in order
-    #[arg(
-        long,
-        value_delimiter = ',',
-        value_name = "KEYS",
-        default_value = "robot0_eef_pos,robot0_eef_quat,robot0_gripper_qpos"
-    )]
-    state_keys: Vec<String>,
-    /// Observation keys of the environment state, in order
-    #[arg(long, value_delimiter = ',', value_name = "KEYS", default_value = "object")]
-    env_keys: Vec<String>,
+    /// Observation keys of the robot state, in order [default: those of the entry that was exported, else
+    /// robot0_eef_pos,robot0_eef_quat,robot0_gripper_qpos]
+    #[arg(long, value_delimiter = ',', value_name = "KEYS")]
+    state_keys: Option<Vec<String>>,
+    /// Observation keys of the environment state, in order [default: those of the entry that was exported, else object]
+    #[arg(long, value_delimiter = ',', value_name = "KEYS")]
+    env_keys: Option<Vec<String>>,
 }
 
 /// Import a checkpoint folder of LeRobot's ACT or diffusion
@@ -93,12 +90,14 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         }
         From::Robomimic(args) => {
             let NamedArgs { name, task, state_keys, env_keys } = &args.named;
+            let usual = DataSection::default();
+            let env_keys = env_keys.clone().unwrap_or(usual.env_keys);
             let options = robomimic::ImportOptions {
                 name: name.clone(),
                 task: task.clone(),
-                state_keys: state_keys.clone(),
+                state_keys: state_keys.clone().unwrap_or(usual.state_keys),
                 // "" makes none
-                env_keys: env_keys.iter().filter(|key| !key.is_empty()).cloned().collect(),
+                env_keys: env_keys.into_iter().filter(|key| !key.is_empty()).collect(),
             };
             let python = rollout::find_python(args.python.as_deref())?;
             (robomimic::import(&args.file, &options, &python, &args.zoo.zoo)?, &args.zoo.zoo)

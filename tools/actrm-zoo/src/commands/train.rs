@@ -1,3 +1,4 @@
+use std::cell::Cell;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -246,7 +247,7 @@ fn extend_run(args: &Args, run: &Path) -> anyhow::Result<ExitCode> {
         experiment,
         data: None,
         runs: PathBuf::new(),
-        run: Some(folder),
+        run: Some(folder.clone()),
         resume: true,
         zoo: args.zoo.zoo.clone(),
         from_zoo: None,
@@ -255,8 +256,16 @@ fn extend_run(args: &Args, run: &Path) -> anyhow::Result<ExitCode> {
         command: None,
         device: args.device,
     };
-    let outcome = train(&request, &|| stop.asked(), &mut |event| show(&event, &mut screen, &stop));
+    let begun = Cell::new(false);
+    let outcome = train(&request, &|| stop.asked(), &mut |event| {
+        begun.set(begun.get() || matches!(event, TrainEvent::Step(_)));
+        show(&event, &mut screen, &stop);
+    });
     drop(screen);
+    if outcome.is_err() && !begun.get() {
+        // nothing is in it but copies: it must not be the latest run, which --resume takes up
+        let _ = std::fs::remove_dir_all(&folder);
+    }
     match outcome? {
         TrainOutcome::Finished { entry, run, minutes } => {
             let (zoo, run) = (shown(&args.zoo.zoo), shown(&run));

@@ -145,6 +145,8 @@ def extract(
     env.hard_reset |= session.xml_forgotten
     session.foreign_model = True
     env.set_ep_meta(dict(ep_meta or {}))
+    # what a reset draws and the demonstration does not hold must not depend on what this worker did before
+    env.rng.bit_generator.state = np.random.default_rng(0).bit_generator.state
     if model_file:
         env.reset()
         try:
