@@ -180,6 +180,8 @@ pub fn result_folders(results: &Path) -> Result<Vec<PathBuf>, ResultsError> {
 /// Refuses outcomes that no episode can have.
 fn check_outcomes(path: &Path, record: &EvaluationRecord, episodes: &[EpisodeRecord]) -> Result<(), ResultsError> {
     let most = record.protocol.max_steps;
+    // what a simulator of the user's says of progress and failures is its own
+    let is_ours = record.protocol.env_module.is_none();
     let is_hash = |text: &str| text.len() == 64 && text.bytes().all(|byte| matches!(byte, b'0'..=b'9' | b'a'..=b'f'));
     for episode in episodes {
         let EpisodeRecord { seed, success, steps, total_reward, fingerprint, failure, progress, .. } = episode;
@@ -189,10 +191,10 @@ fn check_outcomes(path: &Path, record: &EvaluationRecord, episodes: &[EpisodeRec
             ("return", "a finite number".to_owned(), total_reward.to_string())
         } else if let Some(progress) = progress.filter(|progress| !(0.0..=1.0).contains(progress)) {
             ("progress", "0 to 1".to_owned(), progress.to_string())
-        } else if let Some(progress) = progress.filter(|progress| (*progress == 1.0) != *success) {
+        } else if let Some(progress) = progress.filter(|progress| is_ours && (*progress == 1.0) != *success) {
             let expected = if *success { "1 of a success" } else { "less than 1 of a failure" };
             ("progress", expected.to_owned(), progress.to_string())
-        } else if let Some(failure) = failure.as_ref().filter(|_| *success) {
+        } else if let Some(failure) = failure.as_ref().filter(|_| is_ours && *success) {
             ("failure", "none of a success".to_owned(), failure.clone())
         } else if !is_hash(fingerprint) {
             ("fingerprint", "64 hexadecimal digits".to_owned(), format!("{fingerprint:?}"))

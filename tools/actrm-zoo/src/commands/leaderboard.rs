@@ -85,8 +85,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let (depths, damaged) = depths(&args.depths, &entries)?;
     let left_out = left_out.chain(&damaged);
     failures.extend(left_out.map(|left| failure(&format!("left out: {}", shown(&left.folder)), &left.reason)));
-    let notes: Vec<String> =
-        robots.under_way.iter().map(|found| format!("note: {}: {found}", shown(&found.folder))).collect();
+    let under_way = robots.under_way.iter().map(|found| format!("note: {}: {found}", shown(&found.folder)));
+    let doubts = robots.doubts.iter().map(|(folder, doubt)| format!("note: {}: {doubt}", shown(folder)));
+    let notes: Vec<String> = under_way.chain(doubts).collect();
     let end = || {
         notes.iter().for_each(|note| cli::note(note));
         failures.iter().for_each(|failure| cli::note(failure));

@@ -70,7 +70,7 @@ pub struct Args {
     /// Folder of runs; this run is stored in DIR/EXPERIMENT/NUMBER
     #[arg(long, value_name = "DIR", default_value = "runs")]
     runs: PathBuf,
-    /// Folder of this run
+    /// Folder of this run, new or empty
     #[arg(long, value_name = "DIR")]
     run: Option<PathBuf>,
     /// Resume the latest run of this experiment, or the one in --run

@@ -67,6 +67,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     for found in robots.under_way.iter().filter(|found| asked(&found.folder)) {
         notes.push(format!("result {}: {found}", shown(&found.folder)));
     }
+    for (folder, doubt) in robots.doubts.iter().filter(|(folder, _)| asked(folder)) {
+        notes.push(format!("result {}: {doubt}", shown(folder)));
+    }
     for SameWeights { entries, impossible } in entries.same_weights() {
         if args.entries.is_empty() || entries.iter().any(|id| ids.contains(id)) {
             let names: Vec<String> = entries.iter().map(ToString::to_string).collect();
