@@ -174,6 +174,12 @@ fn overview(text: &mut String, study: &Study, results: &Results) {
         if alone { format!("{task}{expert}{skill}") } else { format!("{task}, {episodes}{expert}{skill}") }
     };
     let heads: Vec<String> = columns.iter().map(head).collect();
+    // others of the same kind: their name tells them apart
+    let twice = |head: &String| heads.iter().filter(|other| *other == head).count() > 1;
+    let named = |(head, (data, _)): (&String, &(&str, &str))| {
+        if twice(head) { format!("{head}, {data}") } else { head.clone() }
+    };
+    let heads: Vec<String> = heads.iter().zip(&columns).map(named).collect();
     let _ = writeln!(
         text,
         "## Success\n\nSuccess with its 95% interval over trainings and episodes, and the number of trainings.\n\n| | {} |\n|---|{}",
