@@ -35,6 +35,8 @@ class Look:
 LOOKS = (Look(8, 5, 0.001, 0.0), Look(10, 10, 0.005, 0.01), Look(13, 13, 0.015, 0.02), Look(16, 16, 0.04, 0.04))
 
 
+NEW_DEMONSTRATIONS = "ead6b3a1"
+"""Fingerprint of those of stage 5."""
 RANK_LOOKS = ((10, 0.02), (16, 0.04))
 """Stage 5: trainings of each arm, two-sided level."""
 
@@ -158,7 +160,7 @@ def report(folder: Path) -> str:
         )
         if differ or equivalent:
             break
-    new = [successes(folder, arm, "pickchain-new", "") for arm in ARMS]
+    new = [successes(folder, arm, "pickchain-new", NEW_DEMONSTRATIONS) for arm in ARMS]
     lines.append(f"stage 5: tied: {len(new[0])} trainings, untied: {len(new[1])}")
     for trainings, level in RANK_LOOKS:
         if min(map(len, new)) < trainings:

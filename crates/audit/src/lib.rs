@@ -109,7 +109,7 @@ impl KnownEntries {
             let seeds: Vec<(String, u64)> = found.iter().filter_map(|entry| seed(entry)).collect();
             let twice = |(family, seed): &(String, u64)| seeds.iter().any(|(of, other)| of == family && other != seed);
             let impossible = seeds.iter().any(twice);
-            // versions of one name may be the same training, made again
+            // versions of one entry may be the same training, run again
             let told = impossible || found.iter().any(|entry| entry.meta().name != found[0].meta().name);
             told.then(|| SameWeights { impossible, entries: found.iter().map(|entry| entry.id()).collect() })
         };
@@ -245,8 +245,8 @@ impl Audit<StoredEvaluation> {
                     found.iter().find(|(other, _)| other != &print).map(|(_, of)| of[0]).unwrap_or(Path::new(""));
                 for &folder in folders {
                     let text = format!(
-                        "the episode of seed {seed} begins otherwise than in {}: on another kind of processor, or it was not \
-                         run; `eval --again` shows which",
+                        "the initial state of seed {seed} is not that in {}: it was computed on another kind of processor, or \
+                         the result was edited; `eval --again` checks it",
                         other.display()
                     );
                     doubts.entry(folder.to_owned()).or_insert(text);
@@ -375,7 +375,10 @@ mod tests {
         stored.seal().unwrap();
         let Audit { standing, doubts, .. } = audited(zoo.path());
         let [(doubted, text)] = doubts.as_slice() else { panic!("{doubts:?}") };
-        assert!(standing.len() == 3 && *doubted == folder && text.contains("seed 10004 begins otherwise"), "{text}");
+        assert!(
+            standing.len() == 3 && *doubted == folder && text.contains("initial state of seed 10004 is not that in"),
+            "{text}"
+        );
     }
 
     #[test]

@@ -505,5 +505,5 @@ fn notes(dataset: &dataset::Dataset, samples: &Samples) -> Vec<String> {
     let rounded = rounded.map(|c| format!("{}: whole numbers beyond {MOST_WHOLE} are rounded to float32", c.name));
     let features = &dataset.info().features.0;
     let language = features.iter().filter(|(_, feature)| feature.dtype == "language");
-    rounded.chain(language.map(|(name, _)| format!("{name}: samples have no language"))).collect()
+    rounded.chain(language.map(|(name, _)| format!("{name}: samples lack columns of language"))).collect()
 }

@@ -57,8 +57,8 @@ def test_columns_have_the_types_that_lerobot_wrote() -> None:
     assert ds.features["cells"] == {"dtype": "int32", "shape": (2,), "names": ["row", "column"]}
     assert ds.features["note"]["names"] is None and ds.notes == []
     assert actrm.Dataset(FIXTURES / "lerobot_language").notes == [
-        "language_persistent: samples have no language",
-        "language_events: samples have no language",
+        "language_persistent: samples lack columns of language",
+        "language_events: samples lack columns of language",
     ]
 
 

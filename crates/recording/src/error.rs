@@ -33,8 +33,8 @@ pub enum RecordingError {
     },
     /// The expert fails too often.
     #[error(
-        "the expert succeeded in {successes} of {attempts} attempts at {task}: too few for {wanted} demos; the attempts stay in \
-         {}, and the same command with fewer --episodes takes them up", kept.display()
+        "the expert succeeded in {successes} of {attempts} attempts at {task}: too few for {wanted} demos; the attempts are kept \
+         in {}; the same command with fewer --episodes uses them", kept.display()
     )]
     TooFewSuccesses {
         /// The task.

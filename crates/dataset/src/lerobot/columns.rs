@@ -120,7 +120,7 @@ pub(super) fn read_columns(
     }
     notes.extend(strangers.into_iter().map(|name| {
         let fate = match INDEX_COLUMNS.contains(&name.as_str()) {
-            true => "a set that is made of this one states it",
+            true => "`edit` writes a set that states it",
             false => "it is left out, with its values",
         };
         format!(

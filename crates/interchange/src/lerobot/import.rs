@@ -139,7 +139,7 @@ pub fn import(folder: &Path, options: &ImportOptions, zoo: &Path) -> Result<Entr
     if let Some(origin) = origin.as_ref().filter(|origin| origin.task != options.task) {
         return Err(ZooError::InvalidValue {
             key: "--task".to_owned(),
-            expected: format!("{}, which the entry was trained for that was exported", origin.task),
+            expected: format!("{}, the task of the exported entry", origin.task),
             found: options.task.clone(),
         });
     }
@@ -198,7 +198,7 @@ fn keys_of(
     match (asked, known) {
         (Some(asked), Some(known)) if *asked != known => Err(ZooError::InvalidValue {
             key: option.to_owned(),
-            expected: format!("{}, which the entry reads that was exported", known.join(",")),
+            expected: format!("{}, the keys of the exported entry", known.join(",")),
             found: asked.join(","),
         }),
         (Some(asked), _) => Ok(asked.clone()),

@@ -166,7 +166,7 @@ impl Library {
         match (parts, change) {
             (_, Some(change)) if is_own || is_recipe => Err(ZooError::InvalidValue {
                 key: change.split('=').next().unwrap_or_default().to_owned(),
-                expected: format!("none beside {name}, a file whose settings are for its own policy, task and inputs"),
+                expected: format!("no change to {name}, whose file has settings for its own policy, task and inputs"),
                 found: change.clone(),
             }),
             (parts, _) => parts.ok_or_else(|| self.unknown(name)),

@@ -247,7 +247,7 @@ mod tests {
         let (_folder, library) =
             library(&[("act_lift", "extends = 'bc_lift'"), ("task/here", "[for.imgae.train]\nsteps = 7")]);
         let error = library.choose(&["act_lift".to_owned(), "inputs=image".to_owned()]).unwrap_err().to_string();
-        assert!(error.starts_with("key `inputs`: expected none beside act_lift, a file"), "{error}");
+        assert!(error.starts_with("key `inputs`: expected no change to act_lift, whose file"), "{error}");
         let error = library.resolve("act_here").unwrap_err().to_string();
         assert!(error.contains("`task/here: for.imgae`") && error.contains("did you mean `image`?"), "{error}");
     }

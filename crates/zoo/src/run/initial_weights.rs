@@ -87,7 +87,7 @@ impl InitialWeights {
         for feature in keys.features().filter(|feature| !feature.starts_with(IMAGE_PREFIX)) {
             let (there, here) = (self.keys.of(feature), keys.of(feature));
             if !there.is_empty() && there != here {
-                note.push_str(&format!("; {feature} was {} there, is {} here", there.join(", "), here.join(", ")));
+                note.push_str(&format!("; {feature}: {} in that entry, {} here", there.join(", "), here.join(", ")));
             }
         }
         Ok(note)

@@ -209,7 +209,7 @@ impl Source<'_> {
         let marked = self.dataset.column(MISTAKE).is_some_and(|marks| marks.data.iter().any(|mark| *mark != 0.0));
         if marked && !self.experiment.data.mistakes {
             let reason = format!(
-                "data.{name}: expected demonstrations as a whole, found marked mistakes, between which they are read; set \
+                "data.{name}: expected demonstrations without marked mistakes, at which they are cut; set \
                  data.mistakes=true"
             );
             return Err(ZooError::UnfitData { path: self.path.to_owned(), reason });

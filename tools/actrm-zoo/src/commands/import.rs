@@ -32,11 +32,11 @@ struct NamedArgs {
     /// Task that the policy was trained for
     #[arg(long)]
     task: String,
-    /// Observation keys of the robot state, in order [default: those of the entry that was exported, else
+    /// Observation keys of the robot state, in order [default: those of the exported entry, else
     /// robot0_eef_pos,robot0_eef_quat,robot0_gripper_qpos]
     #[arg(long, value_delimiter = ',', value_name = "KEYS")]
     state_keys: Option<Vec<String>>,
-    /// Observation keys of the environment state, in order [default: those of the entry that was exported, else object]
+    /// Observation keys of the environment state, in order [default: those of the exported entry, else object]
     #[arg(long, value_delimiter = ',', value_name = "KEYS")]
     env_keys: Option<Vec<String>>,
 }
