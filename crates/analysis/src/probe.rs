@@ -91,16 +91,22 @@ pub struct ProbeCell {
 }
 
 impl ProbeResult {
+    /// The form that this program writes.
+    const FORMAT: u32 = 1;
+
     /// Reads a result.
     ///
     /// # Errors
     /// A file that cannot be read, or is no result.
     pub fn read(path: &Path) -> Result<Self, ZooError> {
         let text = std::fs::read_to_string(path).map_err(ZooError::io("read", path))?;
-        serde_json::from_str(&text).map_err(|e| ZooError::Malformed {
-            path: path.to_owned(),
-            reason: format!("not the result of a probe: {e}"),
-        })
+        let malformed = |reason: String| ZooError::Malformed { path: path.to_owned(), reason };
+        let result: Self =
+            serde_json::from_str(&text).map_err(|e| malformed(format!("not the result of a probe: {e}")))?;
+        if result.format != Self::FORMAT {
+            return Err(malformed(format!("format: expected {}, found {}", Self::FORMAT, result.format)));
+        }
+        Ok(result)
     }
 
     /// Writes it.
@@ -286,7 +292,7 @@ pub fn probe(
         Ok(Reading { state: state.to_owned(), cells })
     };
     Ok(ProbeResult {
-        format: 1,
+        format: ProbeResult::FORMAT,
         entry: subject.entry.clone(),
         training: subject.training.clone(),
         demonstrations: firsts.len() as u64,

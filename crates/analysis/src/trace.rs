@@ -251,7 +251,7 @@ impl PolicyTrace {
     pub fn to_text(&self) -> String {
         let how = if self.success { "success" } else { "failure" };
         let mut text = format!(
-            "{} on {}, seed {}: {how} after {} steps, return {:.2}, asked {} times\n\n",
+            "{} on {}, seed {}: {how} after {} steps, return {:.2}, {} queries\n\n",
             self.entry,
             self.task,
             self.seed,
@@ -435,7 +435,7 @@ mod tests {
     fn text_has_a_line_for_each_step_of_a_thought() {
         let text = sample().to_text();
         let lines: Vec<&str> = text.lines().collect();
-        assert_eq!(lines[0], "lift-actrm@1 on Lift, seed 7: success after 3 steps, return 1.00, asked 2 times");
+        assert_eq!(lines[0], "lift-actrm@1 on Lift, seed 7: success after 3 steps, return 1.00, 2 queries");
         assert_eq!(lines[2], "  step  thought   change   halt       ms  executed  first action");
         assert_eq!(lines[3], "     0        1        -  0.100    0.250            +0.125 -1.000");
         assert_eq!(lines[4], "              2   0.0625  0.950    0.250         2  +0.250 -1.000");

@@ -300,18 +300,23 @@ impl SudokuTask {
     /// A puzzle with a unique solution and at least `givens` cells given: cells are emptied in random order while the
     /// solution stays unique, until `givens` are left or no further cell can go. Its solution belongs to `split`.
     pub fn draw_from(self, split: Split, givens: usize, rng: &mut PuzzleRng) -> Sudoku {
-        let solution = loop {
-            let full = self.full_grid(rng);
-            if Split::of(fingerprint(full.iter().map(|&digit| u64::from(digit)))) == split {
-                break full;
-            }
-        };
+        let solution = self.solution_from(split, rng);
         let mut puzzle = solution.clone();
         self.empty_to(&mut puzzle, givens, rng);
         if self.is_rated() {
             self.climb(&mut puzzle, &solution, givens, rng);
         }
         Sudoku { puzzle, solution }
+    }
+
+    /// A full grid that belongs to `split`.
+    pub(crate) fn solution_from(self, split: Split, rng: &mut PuzzleRng) -> Vec<u8> {
+        loop {
+            let full = self.full_grid(rng);
+            if Split::of(fingerprint(full.iter().map(|&digit| u64::from(digit)))) == split {
+                return full;
+            }
+        }
     }
 
     /// Empties cells in random order while the solution stays unique, until `givens` are left or no further cell can go.

@@ -87,6 +87,19 @@ impl Task {
     pub fn numbered(self, split: Split, givens: (usize, usize), seed: u64, index: u64) -> Puzzle {
         self.draw(split, givens, &mut PuzzleRng::new(seed, index))
     }
+
+    /// The answer of that puzzle. Of a Sudoku it is drawn without the search for its givens.
+    pub fn numbered_answer(self, split: Split, (fewest, most): (usize, usize), seed: u64, index: u64) -> Vec<u8> {
+        match self {
+            Self::Maze(_) => self.numbered(split, (fewest, most), seed, index).answer(),
+            Self::Sudoku(task) => {
+                let mut rng = PuzzleRng::new(seed, index);
+                // the number of givens comes first
+                rng.between(fewest, most.max(fewest));
+                task.solution_from(split, &mut rng)
+            }
+        }
+    }
 }
 
 /// One puzzle with its answer.
@@ -254,6 +267,7 @@ mod tests {
             for index in 0..20 {
                 let puzzle = task.numbered(Split::Test, givens(task), 5, index);
                 assert_eq!(puzzle, task.numbered(Split::Test, givens(task), 5, index));
+                assert_eq!(puzzle.answer(), task.numbered_answer(Split::Test, givens(task), 5, index));
                 let (tokens, answer) = (puzzle.tokens(), puzzle.answer());
                 assert_eq!((tokens.len(), answer.len()), (task.cells(), puzzle.cells()));
                 assert!(tokens.iter().all(|&token| usize::from(token) < task.vocabulary()));

@@ -11,9 +11,9 @@ use audit::KnownEntries;
 use puzzles::Task;
 use report::csv;
 use study::puzzle::{
-    AnyExperiment, Baseline, Judge, PUZZLE_COLUMNS, PuzzleEvaluation, PuzzleEvaluationOptions, PuzzleTrainRequest,
-    RECORD_FILE, SolverEntry, Starts, TEST_SEED, audit_puzzles, evaluate_puzzles, evaluate_puzzles_again,
-    list_puzzle_evaluations, trace, train_puzzles,
+    AnyExperiment, Baseline, DEPTH, Judge, PUZZLE_COLUMNS, PuzzleEvaluation, PuzzleEvaluationOptions, PuzzleExperiment,
+    PuzzleTrainRequest, RECORD_FILE, SolverEntry, Starts, TEST_SEED, audit_puzzles, evaluate_puzzles,
+    evaluate_puzzles_again, trace, train_puzzles,
 };
 use zoo::config::Library;
 use zoo::entry::Entry;
@@ -46,7 +46,7 @@ fn evaluated(entry: &Entry, root: &Path, puzzles: u64) -> PuzzleEvaluation {
         task: None,
         givens: None,
         puzzles,
-        depth: 4,
+        depth: DEPTH,
         seed: TEST_SEED,
         starts: Starts::ONE,
         views: 1,
@@ -253,7 +253,6 @@ fn an_entry_is_evaluated_once_shown_on_the_board_and_refused_where_it_does_not_f
     let results: PathBuf = root.path().join("zoo/results");
     let first = evaluated(&entry, root.path(), 20);
     assert_eq!(first, evaluated(&entry, root.path(), 20), "a finished one is read again");
-    assert_eq!(list_puzzle_evaluations(&results).unwrap(), std::slice::from_ref(&first));
     let entries = KnownEntries::open(&Registry::open(&root.path().join("zoo"))).unwrap();
     let board = || audit_puzzles(&results, &entries).unwrap();
     assert_eq!((board().standing, board().left_out.len()), (vec![first.clone()], 0));
@@ -264,7 +263,7 @@ fn an_entry_is_evaluated_once_shown_on_the_board_and_refused_where_it_does_not_f
     let reason = board().left_out[0].reason.to_string();
     assert!(reason.contains("puzzles.json: sha256 does not match"), "{reason}");
     std::fs::write(&record, honest).unwrap();
-    assert_eq!(first.by_depth.keys().copied().collect::<Vec<_>>(), [1, 2, 4]);
+    assert_eq!(first.by_depth.keys().copied().collect::<Vec<_>>(), [1, 2, 4, 8, 16]);
     assert_eq!((first.answers.puzzles, first.task.as_str()), (20, "dfs10"));
     assert!(csv::table(PUZZLE_COLUMNS, [&first]).contains("trm-dfs10,1,trm,dfs10"));
     assert!(entry.card().unwrap().contains("processor time"));
@@ -281,6 +280,27 @@ fn an_entry_is_evaluated_once_shown_on_the_board_and_refused_where_it_does_not_f
     let cnn = finish(&request(root.path(), "mlp_maze8-original", &TINY));
     let error = SolverEntry::load(&cnn, Some(task("dfs10"))).err().unwrap().to_string();
     assert!(error.contains("expected 8x8, found 10x10"), "{error}");
+    // what would have no effect is refused
+    let usual = PuzzleEvaluationOptions {
+        task: None,
+        givens: None,
+        puzzles: 5,
+        depth: DEPTH,
+        seed: TEST_SEED,
+        starts: Starts::ONE,
+        views: 1,
+        judge: Judge::Halting,
+    };
+    let cnn = SolverEntry::load(&cnn, None).unwrap();
+    for (key, options) in [
+        ("--givens", PuzzleEvaluationOptions { givens: Some(5), ..usual.clone() }),
+        ("--depth", PuzzleEvaluationOptions { depth: 4, ..usual.clone() }),
+        ("--starts", PuzzleEvaluationOptions { starts: Starts { most: 3, noise: 1.0 }, ..usual.clone() }),
+        ("--views", PuzzleEvaluationOptions { views: 4, ..usual.clone() }),
+    ] {
+        let error = evaluate_puzzles(&cnn, &results, &options).unwrap_err().to_string();
+        assert!(error.starts_with(&format!("key `{key}`: expected")), "{error}");
+    }
 }
 
 #[test]
@@ -299,6 +319,39 @@ fn experiments_that_cannot_work_are_refused_by_key() {
     assert!(error("ppo_mlp_maze5-walls", "task.puzzle=sudoku4").contains("mazes that have a way"));
     assert!(error("a2c_trm_maze5-walls", "rl.mirrored=true").contains("only PPO"));
     assert!(error("ppo_mlp_maze5-walls", "rl.algorithm=sarsa").contains("one of a2c, ppo, reinforce, search"));
+    for (name, key, value) in [
+        ("small-trm_open8", "model.supervision_steps", "0"),
+        ("small-trm_open8", "model.inner_steps", "0"),
+        ("small-trm_open8", "model.latent", "0"),
+        ("small-trm_open8", "model.hidden", "1000000000000"),
+        ("cnn_open8", "model.channels", "[0]"),
+        ("mlp_maze8-original", "model.hidden", "[0]"),
+        ("transformer_dfs10", "model.dim", "0"),
+        ("transformer_dfs10", "model.dim", "1"),
+        ("transformer_dfs10", "model.heads", "0"),
+        ("reinforce_trm3_maze5-rl", "model.high", "0"),
+        ("reinforce_trm3_maze5-rl", "model.high", "1"),
+        ("reinforce_trm3_maze5-rl", "model.low", "0"),
+        ("search_trm_maze5-walls", "model.cycles", "1"),
+        ("trm_dfs10", "task.train_puzzles", "9000000000000000000"),
+        ("trm_dfs10", "task.valid_puzzles", "0"),
+        ("trm_dfs10", "learning.halt_weight", "-1.0"),
+        ("trm_dfs10", "learning.halt_weight", "nan"),
+        ("trm_dfs10", "learning.state_noise", "inf"),
+        // without effect
+        ("reinforce_mlp_maze5-rl", "rl.clip", "0.1"),
+        ("a2c_mlp_maze5-rl", "rl.epochs", "2"),
+        ("search_trm_maze5-walls", "rl.target_kl", "0.1"),
+        ("cnn_open8", "learning.halt_weight", "0.5"),
+        ("small-trm_open8", "learning.release_solved", "0.5"),
+    ] {
+        let error = error(name, &format!("{key}={value}"));
+        assert!(error.starts_with(&format!("key `{key}`: expected ")), "{name} {key}={value}: {error}");
+    }
+    // an entry that was trained with such a setting is read
+    let mut old = request(Path::new(""), "reinforce_mlp_maze5-rl", &[]).experiment;
+    old.rl.as_mut().unwrap().clip = 0.1;
+    assert_eq!(PuzzleExperiment::from_toml("old", &old.to_toml()).unwrap(), old);
     let root = tempfile::tempdir().unwrap();
     let request = request(root.path(), "trm_dfs10", &["model.mixing=attention", "model.num_heads=5"]);
     let error = train_puzzles(&request, &|| false, &mut |_| {}).unwrap_err();

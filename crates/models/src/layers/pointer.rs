@@ -1,4 +1,4 @@
-//! Pointing: which of several things is meant, told beside the actions.
+//! Pointer: a classification head over entity tokens; which of several entities the policy acts on.
 //!
 //! A score for each candidate, read off its token after everything was encoded; softmax over them. The candidate's token
 //! as it came in, averaged by these shares, becomes one more token for whatever decodes the actions. Where demonstrations

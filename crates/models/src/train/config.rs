@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 pub enum Schedule {
     /// stays
     Constant,
-    /// falls along half a cosine to `lr * min_lr_ratio` at the last step
+    /// falls along half a cosine; the step after the last would have `lr * min_lr_ratio`
     #[default]
     Cosine,
 }

@@ -49,11 +49,17 @@ fn normal_cdf(x: f32) -> (f32, f32) {
     (if x > 0.0 { 1.0 - tail } else { tail }, density)
 }
 
+/// The positive part. NaN stays NaN, and adding 0 makes -0 into 0.
+#[inline(always)]
+pub fn relu(x: f32) -> f32 {
+    (if x < 0.0 { 0.0 } else { x }) + 0.0
+}
+
 /// Activation, then dropout, of a stretch of a row.
 #[inline(always)]
 pub fn activate(x: &mut [f32], activation: Activation, mask: Option<DropoutMask>, first: usize) {
     match activation {
-        Activation::Relu => x.iter_mut().for_each(|x| *x = x.max(0.0)),
+        Activation::Relu => x.iter_mut().for_each(|x| *x = relu(*x)),
         Activation::Gelu => x.iter_mut().for_each(|x| *x *= normal_cdf(*x).0),
         Activation::Glu => unreachable!("refused by the configuration"),
     }
@@ -88,11 +94,11 @@ pub fn activate_backward(
     }
 }
 
-/// exp(x) to 2 ulp, for x <= 0, in operations that vectorise (Cephes' polynomial).
+/// exp(x) to 2 ulp, for x <= 0, in operations that vectorise (Cephes' polynomial). NaN stays NaN.
 #[inline(always)]
 pub fn exp(x: f32) -> f32 {
     const MAGIC: f32 = 12_582_912.0; // 1.5 * 2^23: adding it rounds to an integer in the low bits
-    let x = x.max(-87.0);
+    let x = if x < -87.0 { -87.0 } else { x };
     let shifted = x * std::f32::consts::LOG2_E + MAGIC;
     let n = shifted - MAGIC;
     let r = x - n * 0.693_359_4 + n * 2.121_944_4e-4;
@@ -171,5 +177,11 @@ mod tests {
             assert!((got - want).abs() <= 3e-7 * want, "{x}: {got} {want}");
         }
         assert!(exp(-1e30) < 1e-37);
+    }
+
+    #[test]
+    fn nan_is_not_swallowed() {
+        assert!([exp, relu, sigmoid, tanh].iter().all(|of| of(f32::NAN).is_nan()));
+        assert_eq!([relu(-1.0), relu(-0.0), relu(2.0)].map(f32::to_bits), [0.0, 0.0, 2.0_f32].map(f32::to_bits));
     }
 }

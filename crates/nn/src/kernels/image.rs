@@ -2,6 +2,7 @@
 //! pixel; convolutions read them from frames of zeros and write them without.
 
 use super::conv::Frame;
+use super::elementwise::relu;
 use crate::simd::vectorised;
 
 /// Added to variances, torch's.
@@ -87,7 +88,7 @@ pub fn scale_relu(y: &[f32], scale: &[f32], shift: &[f32], shortcut: Option<&[f3
                 if let Some(x) = shortcut {
                     out.iter_mut().zip(&x[at..at + row]).for_each(|(out, x)| *out += x);
                 }
-                out.iter_mut().for_each(|x| *x = x.max(0.0));
+                out.iter_mut().for_each(|x| *x = relu(*x));
             }
         },
     );

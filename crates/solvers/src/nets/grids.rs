@@ -3,7 +3,8 @@
 //! Sizes follow the study's code (acharyaanusha/Tiny-Recursive-Model,
 //! `experiments/simple_maze_comparison.py` and `maze_comparison.py`), so that the parameter
 //! counts agree: CNN 74,850, Transformer 616,514, small TRM 9,922 and 28,258. Initial weights
-//! come from our own generator.
+//! come from our own generator. The Transformer's positions have a standard deviation of 0.02, there 1, and it has no
+//! dropout, there 0.1. What differs in the small TRM is in `small_trm`.
 
 use candle_core::Tensor;
 use models::layers::{Activation, FeedForward, LayerNorm, Linear, MultiHeadAttention};

@@ -2,9 +2,13 @@
 //!
 //! Reference: acharyaanusha/Tiny-Recursive-Model, `SimpleTRM` and the TRM of
 //! `maze_comparison.py`. Cells see each other only through the stem; with a dense stem not at
-//! all. As there, `z` is overwritten rather than added to, only the last inner step keeps a
-//! graph, and the embedded answer carries no gradient to the step before. Our one liberty: the
-//! first answer is the uniform one.
+//! all. As there, `z` is overwritten rather than added to, the first answer is the uniform one, and from the second
+//! supervision step on only the last inner step keeps a graph.
+//!
+//! Differences: there the first supervision step, too, keeps the graph of its last inner step only, so `z_init` never
+//! learns; here the whole step is propagated back. There the head reads the answer before with its gradient, here
+//! without. There the loss is divided by the number of supervision steps. `z_init` has a standard deviation of 0.02,
+//! there 0.1.
 
 use super::grids::{Conv3x3, GridDims, GridModel, channels_last};
 use candle_core::{D, DType, Device, Tensor};

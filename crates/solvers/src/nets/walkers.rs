@@ -3,7 +3,10 @@
 //!
 //! Sizes of [`MlpWalker`] (20,356 on the 5x5 maze) and [`TrmWalker`] (69,038 for any number of
 //! cycles) are those of acharyaanusha/Tiny-Recursive-Model, `trm_core/trm_rl.py`; the value head
-//! is ours and optional. [`ConvWalker`] is ours: a small TRM with 3x3 convolutions over the maze.
+//! is ours and optional. [`TrmWalker`] differs from the original in two places. From the second cycle on, the original
+//! adds `carry` of the high state to the output of the high blocks; here it is added to their input. The original
+//! leaves out the previous action in the first step of an episode; here it is action 0.
+//! [`ConvWalker`] is ours: a small TRM with 3x3 convolutions over the maze.
 
 use super::grids::dense;
 use crate::trm::{self, Recursion};
@@ -217,7 +220,7 @@ struct TrmPolicySizes {
     cycles: usize,
 }
 
-/// The study's hierarchical policy: per cycle two SwiGLU blocks on the high state, one dense
+/// A policy like the study's hierarchical one: per cycle two SwiGLU blocks on the high state, one dense
 /// block on the low one, and a way back up.
 #[derive(Debug)]
 pub struct TrmWalker {
@@ -240,7 +243,7 @@ impl TrmWalker {
     fn new(sizes: TrmPolicySizes, previous_action: bool, with_value: bool, rng: &mut Rng) -> Result<Self> {
         let TrmPolicySizes { observation, actions, high, low, cycles } = sizes;
         if cycles < 2 {
-            // with one cycle the way back up is never taken and would get no gradient
+            // with one cycle `carry` is never applied and would get no gradient
             return Err(ModelError::Config {
                 model: "trm policy",
                 field: "cycles",

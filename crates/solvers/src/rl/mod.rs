@@ -53,8 +53,7 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
 /// How a policy is improved.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Algorithm {
     /// Up the log-probability of each action times the standardised return that followed. The network has no value head.
     Reinforce,
@@ -69,54 +68,27 @@ pub enum Algorithm {
         /// Steps per optimiser step; the last batch of a pass may be smaller.
         batch_size: usize,
         /// Ends the passes once the estimated divergence from the policy that acted exceeds this.
-        #[serde(default)]
         target_kl: Option<f64>,
     },
 }
 
 /// What of an update can be chosen.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RlConfig {
     /// How the policy is improved.
     pub algorithm: Algorithm,
     /// Discount per step.
-    #[serde(default = "default_gamma")]
     pub gamma: f64,
     /// Weight of longer estimates in the advantage; 1 takes the whole return, 0 one step.
-    #[serde(default = "default_lambda")]
     pub gae_lambda: f64,
     /// Weight of the entropy bonus.
-    #[serde(default = "default_entropy")]
     pub entropy_weight: f64,
     /// Weight of the value head's squared error.
-    #[serde(default = "default_value")]
     pub value_weight: f64,
     /// Rewards are multiplied by this before anything else, so that values are of the order of 1.
-    #[serde(default = "default_scale")]
     pub reward_scale: f64,
     /// Least standard deviation, in scaled rewards, that advantages are divided by.
-    #[serde(default = "default_floor")]
     pub advantage_std_floor: f64,
-}
-
-fn default_gamma() -> f64 {
-    0.95
-}
-fn default_lambda() -> f64 {
-    0.95
-}
-fn default_entropy() -> f64 {
-    0.01
-}
-fn default_value() -> f64 {
-    0.5
-}
-fn default_scale() -> f64 {
-    0.1
-}
-fn default_floor() -> f64 {
-    0.1
 }
 
 impl Algorithm {
@@ -131,12 +103,12 @@ impl RlConfig {
     pub fn new(algorithm: Algorithm) -> Self {
         Self {
             algorithm,
-            gamma: default_gamma(),
-            gae_lambda: default_lambda(),
-            entropy_weight: default_entropy(),
-            value_weight: default_value(),
-            reward_scale: default_scale(),
-            advantage_std_floor: default_floor(),
+            gamma: 0.95,
+            gae_lambda: 0.95,
+            entropy_weight: 0.01,
+            value_weight: 0.5,
+            reward_scale: 0.1,
+            advantage_std_floor: 0.1,
         }
     }
 

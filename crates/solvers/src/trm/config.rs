@@ -140,6 +140,9 @@ fn default_exploration() -> f64 {
     0.1
 }
 
+/// Most supervision steps of a puzzle.
+const MOST_STEPS: usize = 65_536;
+
 impl Config {
     /// A configuration of the reference's defaults for the given sizes.
     pub fn new(vocab_size: usize, seq_len: usize, hidden_size: usize) -> Self {
@@ -220,6 +223,9 @@ impl Config {
             if value == 0 {
                 return refuse(field, value, "at least 1");
             }
+        }
+        if self.halt_max_steps > MOST_STEPS {
+            return refuse("halt_max_steps", self.halt_max_steps, format!("at most {MOST_STEPS}"));
         }
         let (d, heads) = (self.hidden_size, self.num_heads);
         match self.mixing {

@@ -81,13 +81,12 @@ fn the_kernel_is_the_composed_model_forward_and_backward() {
 }
 
 #[test]
-fn the_number_of_threads_does_not_change_the_forward_pass() {
+fn a_puzzle_is_answered_alone_as_among_others() {
     for config in configs() {
         let model = Trm::new(config.clone(), 3).unwrap();
         let (inputs, identifiers) = puzzles(&config, 7);
         let carry = model.initial_carry(7).unwrap();
         let all = model.supervision_step(&carry, &inputs, Some(&identifiers), Gradient::Off).unwrap();
-        // a puzzle by itself: another group, another thread
         let one = Carry { z_h: carry.z_h.narrow(0, 6, 1).unwrap(), z_l: carry.z_l.narrow(0, 6, 1).unwrap() };
         let (x, id) = (inputs.narrow(0, 6, 1).unwrap(), identifiers.narrow(0, 6, 1).unwrap());
         let one = model.supervision_step(&one, &x, Some(&id), Gradient::Off).unwrap();
@@ -105,6 +104,7 @@ fn impossible_configurations_name_the_field() {
         (Config { mixing: Mixing::Conv, grid: Some([2, 2]), ..base() }, "grid"),
         (Config { puzzle_emb_ndim: 8, ..base() }, "num_puzzle_identifiers"),
         (Config { halt_max_steps: 0, ..base() }, "halt_max_steps"),
+        (Config { halt_max_steps: (1 << 32) + 2, ..base() }, "halt_max_steps"),
     ] {
         let error = Trm::new(config, 0).unwrap_err().to_string();
         assert!(error.contains(field), "{error}");

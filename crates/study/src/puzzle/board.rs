@@ -19,7 +19,9 @@ pub fn rank_puzzles(evaluations: &[PuzzleEvaluation]) -> Vec<PuzzleEvaluation> {
 }
 
 fn order(one: &PuzzleEvaluation, two: &PuzzleEvaluation) -> Ordering {
-    let group = |row: &PuzzleEvaluation| (row.task.clone(), row.givens, row.seed, row.starts.most);
+    let group = |row: &PuzzleEvaluation| {
+        (row.task.clone(), row.givens, row.seed, row.starts.most, row.views, row.judge == Judge::Cells)
+    };
     let share = |row: &PuzzleEvaluation, other: &PuzzleEvaluation| {
         u128::from(row.answers.valid) * u128::from(other.answers.puzzles.max(1))
     };
@@ -128,6 +130,9 @@ pub const PUZZLE_COLUMNS: &[Column<PuzzleEvaluation>] = &[
     count(|row: &PuzzleEvaluation| Some(row.seed)).csv("seed"),
     text(depths_text).page("right after steps"),
     count(|row: &PuzzleEvaluation| Some(row.starts.most)).csv("starts"),
+    count(|row: &PuzzleEvaluation| Some(row.views)).csv("views"),
+    text(|row: &PuzzleEvaluation| row.judge.name().to_owned()).csv("judge"),
+    number(|row: &PuzzleEvaluation| Some(row.starts.noise), 4, 4).csv("noise"),
 ];
 
 fn interval(row: &PuzzleEvaluation) -> (f64, f64) {
@@ -279,5 +284,13 @@ mod tests {
         assert_eq!([task_text(&fresh), task_text(&often)], ["open8, seed 21000", "open8, 8 starts"]);
         let names: Vec<String> = rank_puzzles(&[fresh, often, row("b", 150, "open8")]).iter().map(task_text).collect();
         assert_eq!(names, ["open8", "open8, 8 starts", "open8, seed 21000"]);
+        let views = PuzzleEvaluation { views: 8, ..row("a", 200, "open8") };
+        let cells = PuzzleEvaluation { judge: Judge::Cells, ..views.clone() };
+        let rows = rank_puzzles(&[cells, views, row("b", 150, "open8")]);
+        let names: Vec<String> = rows.iter().map(task_text).collect();
+        assert_eq!(names, ["open8", "open8, 8 views", "open8, 8 views weighed by cells"]);
+        let csv = csv::table(PUZZLE_COLUMNS, &rows);
+        assert!(csv.lines().next().is_some_and(|head| head.ends_with(",starts,views,judge,noise")), "{csv}");
+        assert!(csv.lines().any(|line| line.ends_with(",1,8,cells,0.0000")), "{csv}");
     }
 }

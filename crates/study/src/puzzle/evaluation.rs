@@ -1,7 +1,6 @@
 //! Evaluating a solver on puzzles of the test split, in this process.
 
 use std::collections::BTreeMap;
-use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -34,6 +33,9 @@ pub const RECORD_FILE: &str = "puzzles.json";
 
 const OUTCOMES_FILE: &str = "outcomes.parquet";
 
+/// Most supervision steps, where no other number is asked for.
+pub const DEPTH: usize = 16;
+
 /// Puzzles answered at once.
 const BATCH: usize = 50;
 
@@ -65,6 +67,23 @@ pub struct PuzzleEvaluationOptions {
     pub judge: Judge,
 }
 
+impl PuzzleEvaluationOptions {
+    /// The options as far as a solver and its puzzles take them.
+    ///
+    /// # Errors
+    /// An entry of a family that is not there.
+    pub fn fitting(self, entry: &SolverEntry) -> Result<Self, ZooError> {
+        let givens = match self.task.map_or_else(|| entry.experiment().task.family(), Ok)? {
+            Task::Maze(_) => None,
+            Task::Sudoku(_) => self.givens,
+        };
+        Ok(match entry.solver().is_recursive() {
+            true => Self { givens, ..self },
+            false => Self { givens, depth: DEPTH, starts: Starts::ONE, views: 1, ..self },
+        })
+    }
+}
+
 /// Who says how many votes a view's answer has.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -78,6 +97,14 @@ pub enum Judge {
 }
 
 impl Judge {
+    /// Its name in commands and files.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Halting => "halting",
+            Self::Cells => "cells",
+        }
+    }
+
     #[expect(clippy::trivially_copy_pass_by_ref, reason = "serde hands over a reference")]
     fn is_halting(&self) -> bool {
         *self == Self::Halting
@@ -283,15 +310,6 @@ impl Kept {
         Self { thought: thoughts[at][place].clone(), steps: at + 1, settled: found.is_some() }
     }
 
-    /// What it says for its answer: the probability that the judge gives it, or next to nothing if the answer still changes.
-    fn vote(&self, judge: Judge) -> f32 {
-        let sure = match judge {
-            Judge::Halting => self.thought.halt.unwrap_or(1.0),
-            Judge::Cells => self.thought.confidence.iter().map(|sure| sure.ln()).sum::<f32>().exp(),
-        };
-        if self.settled { sure } else { sure * UNSETTLED }
-    }
-
     /// Takes another start's answer where that is better, by the solver's own lights.
     fn weigh(&mut self, other: Self) {
         let steps = self.steps + other.steps;
@@ -302,11 +320,27 @@ impl Kept {
     }
 }
 
+/// What each view says for its answer: the probability that the judge gives it, or next to nothing if the answer still changes.
+/// The product over an answer's cells may be too small for any number, so products are divided by the largest one.
+fn votes(views: &[Kept], judge: Judge) -> Vec<f32> {
+    let log = |view: &Kept| -> f64 { view.thought.confidence.iter().map(|&sure| f64::from(sure).ln()).sum() };
+    let most = views.iter().map(log).fold(f64::NEG_INFINITY, f64::max);
+    let vote = |view: &Kept| {
+        let sure = match judge {
+            Judge::Halting => view.thought.halt.unwrap_or(1.0),
+            Judge::Cells => (log(view) - most).exp() as f32,
+        };
+        if view.settled { sure } else { sure * UNSETTLED }
+    };
+    views.iter().map(vote).collect()
+}
+
 /// The answer that most of the votes are for, the first of equals, with the steps of all.
 fn elected(views: Vec<Kept>, judge: Judge) -> Kept {
     let steps = views.iter().map(|view| view.steps).sum();
+    let each = votes(&views, judge);
     let votes_for = |answer: &[u8]| -> f32 {
-        views.iter().filter(|view| view.thought.answer == answer).map(|view| view.vote(judge)).sum()
+        views.iter().zip(&each).filter(|(view, _)| view.thought.answer == answer).map(|(_, vote)| vote).sum()
     };
     let votes: Vec<f32> = views.iter().map(|view| votes_for(&view.thought.answer)).collect();
     let best = (0..views.len()).fold(0, |best, at| if votes[at] > votes[best] { at } else { best });
@@ -389,11 +423,31 @@ fn add(counts: &mut Counts, puzzle: &Puzzle, thought: &Thought) {
     counts.add(puzzle, &thought.answer, &thought.on_path);
 }
 
+/// Refuses what the solver or the puzzles cannot do.
+fn check(solver: &Solver, task: Task, options: &PuzzleEvaluationOptions) -> Result<(), ZooError> {
+    let refused = |key: &str, expected: String, found: String| {
+        Err(ZooError::InvalidValue { key: key.to_owned(), expected, found })
+    };
+    if let (Task::Maze(_), Some(givens)) = (task, options.givens) {
+        return refused("--givens", "none: mazes have no givens".to_owned(), givens.to_string());
+    }
+    let counts = [
+        ("--depth", DEPTH as u64, options.depth as u64),
+        ("--starts", 1, options.starts.most),
+        ("--views", 1, options.views),
+    ];
+    match counts.into_iter().find(|(_, usual, found)| !solver.is_recursive() && usual != found) {
+        Some((key, usual, found)) => refused(key, format!("{usual}: only a TRM takes others"), found.to_string()),
+        None => Ok(()),
+    }
+}
+
 /// An evaluation before it was run: what it depends on.
 fn plan(entry: &SolverEntry, options: &PuzzleEvaluationOptions) -> Result<(Task, PuzzleEvaluation), ZooError> {
     let meta = entry.entry().meta();
     let own = entry.experiment().task.family()?;
     let task = options.task.unwrap_or(own);
+    check(entry.solver(), task, options)?;
     let puzzle = entry.meta();
     let givens = match task {
         Task::Maze(_) => 0,
@@ -409,9 +463,9 @@ fn plan(entry: &SolverEntry, options: &PuzzleEvaluationOptions) -> Result<(Task,
         task: task.name().to_owned(),
         givens,
         seed: options.seed,
-        starts: if entry.solver().is_recursive() { options.starts } else { Starts::ONE },
-        views: if entry.solver().is_recursive() { options.views } else { 1 },
-        judge: if entry.solver().is_recursive() && options.views > 1 { options.judge } else { Judge::Halting },
+        starts: options.starts,
+        views: options.views,
+        judge: if options.views > 1 { options.judge } else { Judge::Halting },
         depth: if entry.solver().is_recursive() { options.depth } else { 0 },
         answers: Counts { puzzles: options.puzzles, ..Counts::default() },
         steps: 0,
@@ -566,27 +620,6 @@ pub fn audit_puzzles(results: &Path, entries: &KnownEntries) -> Result<Audit<Puz
     Ok(audit)
 }
 
-/// Every finished evaluation of a solver under `results`, by folder name.
-///
-/// # Errors
-/// The first one that cannot be read.
-pub fn list_puzzle_evaluations(results: &Path) -> Result<Vec<PuzzleEvaluation>, ZooError> {
-    let entries = match std::fs::read_dir(results) {
-        Ok(entries) => entries,
-        Err(error) if error.kind() == ErrorKind::NotFound => return Ok(Vec::new()),
-        Err(error) => return Err(ZooError::io("read folder", results)(error)),
-    };
-    let mut paths = Vec::new();
-    for entry in entries {
-        let path = entry.map_err(ZooError::io("read folder", results))?.path().join(RECORD_FILE);
-        if path.is_file() {
-            paths.push(path);
-        }
-    }
-    paths.sort();
-    paths.iter().map(|path| PuzzleEvaluation::read(path)).collect()
-}
-
 /// One row a puzzle: `index`, `exact`, `valid`, `steps`, `cells_right`.
 fn write_outcomes(path: &Path, rows: &[Row]) -> Result<(), ZooError> {
     Ok(write_atomic(path, &outcomes_bytes(path, rows)?)?)
@@ -661,5 +694,7 @@ mod tests {
             1,
             "what still changes hardly counts"
         );
+        // of a large puzzle the product is too small for a float
+        assert_eq!(answer(vec![kept(1, &[0.5; 400], true), kept(2, &[0.6; 400], true)]), 2);
     }
 }

@@ -17,6 +17,12 @@ use super::model::SolverConfig;
 use super::solver::Solver;
 use super::walk::{RlKind, RlSection};
 
+/// Most training and most validation puzzles of an experiment: the order of the former is kept in memory.
+const MOST_PUZZLES: u64 = 10_000_000;
+
+/// Largest size of a model.
+const LARGEST: usize = 65_536;
+
 /// A resolved experiment on puzzles.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct PuzzleExperiment {
@@ -66,6 +72,7 @@ pub struct PuzzleTask {
     #[serde(default)]
     pub train_puzzles: u64,
     /// Augmentation: number of symmetries of the square (1 to 8) that are sampled in training; a Sudoku's digits are renamed as well.
+    /// A puzzle whose image belongs to another split stays as it is.
     #[serde(default = "one_view", skip_serializing_if = "is_one_view")]
     pub views: u64,
     /// Number of puzzles of the validation split.
@@ -170,10 +177,17 @@ impl PuzzleExperiment {
     pub fn from_toml(name: &str, text: &str) -> Result<Self, ZooError> {
         let table = toml::from_str(text)
             .map_err(|source| ZooError::ExperimentSyntax { experiment: name.to_owned(), source: Box::new(source) })?;
-        Self::from_table(table)
+        Self::read(table)
     }
 
+    /// A new experiment: beside what [`Self::from_toml`] refuses, no setting may be without effect.
     pub(super) fn from_table(table: Table) -> Result<Self, ZooError> {
+        let experiment = Self::read(table)?;
+        experiment.check_used()?;
+        Ok(experiment)
+    }
+
+    fn read(table: Table) -> Result<Self, ZooError> {
         let sections: Sections = from_value(&Value::Table(table), &[])?;
         let experiment = Self {
             entry: sections.entry,
@@ -228,19 +242,25 @@ impl PuzzleExperiment {
                 self.task.views.to_string(),
             );
         }
-        if self.task.valid_puzzles == 0 {
-            return invalid("task.valid_puzzles", "at least 1".to_owned(), "0".to_owned());
+        let (train, valid) = (self.task.train_puzzles, self.task.valid_puzzles);
+        for (key, least, found) in [("task.train_puzzles", 0, train), ("task.valid_puzzles", 1, valid)] {
+            if !(least..=MOST_PUZZLES).contains(&found) {
+                return invalid(key, format!("{least} to {MOST_PUZZLES}"), found.to_string());
+            }
+        }
+        for (key, size, least) in self.model.sizes() {
+            if !(least..=LARGEST).contains(&size) {
+                return invalid(key, format!("{least} to {LARGEST}"), size.to_string());
+            }
         }
         if self.train.accumulation != 1 {
             return invalid("train.accumulation", "1 for puzzles".to_owned(), self.train.accumulation.to_string());
         }
-        let LearningSection { release_solved, disturbed, state_noise, .. } = self.learning;
-        if !(state_noise >= 0.0 && state_noise.is_finite()) {
-            return invalid(
-                "learning.state_noise",
-                "a standard deviation from 0 on".to_owned(),
-                state_noise.to_string(),
-            );
+        let LearningSection { halt_weight, release_solved, disturbed, state_noise, .. } = self.learning;
+        for (key, value) in [("learning.halt_weight", halt_weight), ("learning.state_noise", state_noise)] {
+            if !(value >= 0.0 && value.is_finite()) {
+                return invalid(key, "a finite number, at least 0".to_owned(), value.to_string());
+            }
         }
         for (key, p) in [("learning.release_solved", release_solved), ("learning.disturbed", Some(disturbed))] {
             if let Some(p) = p
@@ -265,6 +285,31 @@ impl PuzzleExperiment {
             }
         }
         self.train.check()
+    }
+
+    /// Refuses settings that only other models or algorithms read.
+    fn check_used(&self) -> Result<(), ZooError> {
+        let (learning, usual) = (&self.learning, LearningSection::default());
+        let mut unused = Vec::new();
+        if !matches!(self.model, SolverConfig::Trm(_)) {
+            unused.extend([
+                ("learning.halt_weight", "a TRM", learning.halt_weight != usual.halt_weight),
+                ("learning.release_solved", "a TRM", learning.release_solved.is_some()),
+                ("learning.disturbed", "a TRM", learning.disturbed != usual.disturbed),
+                ("learning.state_noise", "a TRM", learning.state_noise != usual.state_noise),
+            ]);
+        }
+        if let Some(rl) = self.rl.as_ref().filter(|rl| rl.algorithm != RlKind::Ppo) {
+            unused.extend(rl.of_ppo().map(|(key, changed)| (key, "PPO", changed)));
+        }
+        match unused.into_iter().find(|(_, _, changed)| *changed) {
+            Some((key, reader, _)) => Err(ZooError::InvalidValue {
+                key: key.to_owned(),
+                expected: format!("the default: only {reader} reads it"),
+                found: self.flat().remove(key).unwrap_or_default(),
+            }),
+            None => Ok(()),
+        }
     }
 
     /// The resolved experiment as TOML: the same text for the same experiment.

@@ -169,8 +169,7 @@ fn constant(task: Task, givens: (usize, usize)) -> Vec<u8> {
     let classes = usize::from(task.first_answer()) + task.classes();
     let mut counts = vec![0_u32; task.cells() * classes];
     for index in 0..CONSTANT_FROM {
-        let puzzle = task.numbered(Split::Train, givens, 0, index);
-        for (cell, answer) in puzzle.answer().into_iter().enumerate() {
+        for (cell, answer) in task.numbered_answer(Split::Train, givens, 0, index).into_iter().enumerate() {
             counts[cell * classes + usize::from(answer)] += 1;
         }
     }

@@ -27,8 +27,8 @@ pub use cpu::cpu_seconds;
 pub use door::{AnyExperiment, Summary, TrainOptions, is_solver};
 pub use entry::{ProgressPoint, PuzzleMeta, SOLVER, SolverEntry};
 pub use evaluation::{
-    DEPTHS, EvaluatedPuzzles, Judge, MOST_VIEWS, PuzzleEvaluation, PuzzleEvaluationOptions, RECORD_FILE, Starts,
-    TEST_SEED, audit_puzzles, evaluate_puzzles, evaluate_puzzles_again, list_puzzle_evaluations,
+    DEPTH, DEPTHS, EvaluatedPuzzles, Judge, MOST_VIEWS, PuzzleEvaluation, PuzzleEvaluationOptions, RECORD_FILE, Starts,
+    TEST_SEED, audit_puzzles, evaluate_puzzles, evaluate_puzzles_again,
 };
 pub use experiment::{LearningSection, PuzzleExperiment, PuzzleTask};
 pub use grade::{Baseline, Counts, EffortBand};

@@ -191,6 +191,38 @@ impl SolverConfig {
         Size { weights: layers * width * inner, activations: layers * cells as f64 * (width + inner) }
     }
 
+    /// Its sizes by their keys, with the least that each can be. The TRM refuses its own.
+    pub(super) fn sizes(&self) -> Vec<(&'static str, usize, usize)> {
+        match self {
+            Self::Trm(_) => Vec::new(),
+            Self::SmallTrm(of) => vec![
+                ("model.features", of.features, 1),
+                ("model.latent", of.latent, 1),
+                ("model.answer", of.answer, 1),
+                ("model.hidden", of.hidden, 1),
+                ("model.head", of.head, 1),
+                ("model.inner_steps", of.inner_steps, 1),
+                ("model.supervision_steps", of.supervision_steps, 1),
+            ],
+            Self::Cnn(of) => of.channels.iter().map(|&width| ("model.channels", width, 1)).collect(),
+            // its head has half the width
+            Self::Transformer(of) => vec![
+                ("model.dim", of.dim, 2),
+                ("model.heads", of.heads, 1),
+                ("model.layers", of.layers, 0),
+                ("model.feedforward", of.feedforward, 1),
+            ],
+            Self::Mlp(of) => of.hidden.iter().map(|&width| ("model.hidden", width, 1)).collect(),
+            // likewise
+            Self::Hierarchical(of) => {
+                vec![("model.high", of.high, 2), ("model.low", of.low, 1), ("model.cycles", of.cycles, 2)]
+            }
+            Self::Conv(of) => {
+                vec![("model.hidden", of.hidden, 1), ("model.inner", of.inner, 1), ("model.cycles", of.cycles, 2)]
+            }
+        }
+    }
+
     /// The name that `type` gives it.
     pub fn kind(&self) -> &'static str {
         match self {

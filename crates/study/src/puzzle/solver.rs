@@ -121,7 +121,7 @@ impl Solver {
                 }
             }
             Self::Grid { model, dims, task, probability } => {
-                for (_, scores) in model.forward(&planes(puzzles, *dims)?)?.into_iter().take(steps.max(1)) {
+                for (_, scores) in model.forward(&planes(puzzles, *dims)?)? {
                     thoughts.push(read(*task, *probability, &scores, vec![None; puzzles.len()])?);
                 }
             }
@@ -270,6 +270,19 @@ fn shares(probability: ClassProbability, scores: &[f32]) -> Vec<f32> {
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
+    use solvers::{GridConfig, SmallTrmConfig};
+
+    #[test]
+    fn a_model_without_a_free_number_of_steps_takes_its_own() {
+        let task = Task::by_name("open8").unwrap();
+        let dims = GridDims { channels: 3, height: 8, width: 8, classes: 2 };
+        let model = GridConfig::SmallTrm(SmallTrmConfig::simple()).build(dims, 1).unwrap();
+        let solver = Solver::Grid { model, dims, task, probability: ClassProbability::Softmax };
+        let puzzle = task.numbered(puzzles::Split::Test, (0, 0), 1, 0);
+        for steps in [1, 16] {
+            assert_eq!(solver.think(std::slice::from_ref(&puzzle), steps).unwrap().len(), 5);
+        }
+    }
 
     #[test]
     fn probabilities_add_up_and_follow_the_scores() {

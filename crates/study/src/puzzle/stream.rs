@@ -50,7 +50,7 @@ impl Stream {
             .collect()
     }
 
-    /// The puzzle from one of its sides, another one each time around.
+    /// The puzzle from one of its sides, another one each time around; as it is, where what is seen belongs to another split.
     fn seen(&self, puzzle: Puzzle) -> Puzzle {
         if self.views == 1 {
             return puzzle;
@@ -58,7 +58,12 @@ impl Stream {
         // streams from the middle on: none is a puzzle's, none an order's
         let mut rng = PuzzleRng::new(self.seed, (1 << 63) + self.taken);
         let number = rng.below(self.views as usize) as u64;
-        View::new(self.task, number, &mut rng).puzzle(&puzzle)
+        let seen = View::new(self.task, number, &mut rng).puzzle(&puzzle);
+        let split = match (self.task, &seen) {
+            (Task::Maze(task), Puzzle::Maze(maze)) => task.split_of(maze.grid.walls()),
+            _ => Some(seen.split()),
+        };
+        if split.is_none_or(|split| split == Split::Train) { seen } else { puzzle }
     }
 
     fn next(&mut self) -> u64 {
@@ -127,5 +132,12 @@ mod tests {
         let different: BTreeSet<Vec<u8>> = all.iter().map(Puzzle::tokens).collect();
         // five mazes from eight sides, each with its start in one of four corners
         assert_eq!(different.len(), 40);
+        // of a family with splits, the sides that may be trained on
+        for (name, givens) in [("dfs10", 0), ("sudoku4", 6)] {
+            let task = Task::by_name(name).expect("a family");
+            let all = Stream { task, givens: (givens, givens), ..seen(0) }.take(200);
+            assert!(all.iter().all(|puzzle| puzzle.split() == Split::Train), "{name}");
+            assert!(all.iter().map(Puzzle::tokens).collect::<BTreeSet<_>>().len() > 15, "{name}");
+        }
     }
 }

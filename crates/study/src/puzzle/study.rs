@@ -235,7 +235,8 @@ pub const STUDY: &[StudyRow] = &[
 ];
 
 impl StudyTest {
-    /// The name of the file that holds this test's result for `experiment` with `seed`.
+    /// The name of the file that holds this test's result for `experiment` with `seed`. It leaves out depths up to 32, the noise
+    /// of starts and the number of puzzles, so no two tests of a row may differ in these alone.
     pub fn file_name(&self, experiment: &str, seed: u64) -> String {
         let other = self.task.map_or(String::new(), |task| format!("_on-{task}"));
         let givens = self.givens.map_or(String::new(), |givens| format!("_{givens}-givens"));

@@ -101,6 +101,15 @@ impl RlSection {
         matches!(self.algorithm, RlKind::A2c | RlKind::Ppo)
     }
 
+    /// The keys of PPO's own settings, and whether each is not the default.
+    pub(super) fn of_ppo(&self) -> [(&'static str, bool); 3] {
+        [
+            ("rl.clip", self.clip != default_clip()),
+            ("rl.epochs", self.epochs != default_epochs()),
+            ("rl.target_kl", self.target_kl.is_some()),
+        ]
+    }
+
     fn config(&self, batch_size: usize) -> RlConfig {
         let algorithm = match self.algorithm {
             RlKind::Reinforce | RlKind::Search => Algorithm::Reinforce,

@@ -146,7 +146,7 @@ impl Test {
             Intervention::Freeze => "reasoning frozen after the first step".to_owned(),
             Intervention::Shuffle => "reasoning of another episode".to_owned(),
         });
-        let starts = starts.map(|Starts { count, noise }| format!("best of {count} thoughts, noise {noise}"));
+        let starts = starts.map(|Starts { count, noise }| format!("best of {count} samples, noise {noise}"));
         let words: Vec<String> = [steps, halting, sure, still, intervene, starts].into_iter().flatten().collect();
         (!words.is_empty()).then(|| words.join(", "))
     }
@@ -195,6 +195,13 @@ pub struct Comparison {
     /// 1 for what was planned first; Holm's correction is made stage by stage.
     #[serde(default = "first", skip_serializing_if = "is_first")]
     pub stage: u8,
+}
+
+impl Comparison {
+    /// Arm and demonstrations of both sides.
+    pub(super) fn sides(&self) -> [(&String, &String); 2] {
+        [(&self.first, &self.data), (&self.second, self.second_data.as_ref().unwrap_or(&self.data))]
+    }
 }
 
 fn one() -> u64 {
@@ -267,6 +274,17 @@ impl Study {
                 data(format!("comparisons[{i}].second_data"), second)?;
             }
             tests(format!("comparisons[{i}].test"), &comparison.test)?;
+            for (arm, on) in comparison.sides() {
+                let runs =
+                    |row: &CellRow| row.arms.contains(arm) && row.data == *on && row.tests.contains(&comparison.test);
+                if !self.cells.iter().any(runs) {
+                    return Err(ZooError::InvalidValue {
+                        key: format!("comparisons[{i}]"),
+                        expected: "arms, demonstrations and a test that a cell has".to_owned(),
+                        found: format!("{arm} on {on}, test {}", comparison.test),
+                    });
+                }
+            }
         }
         for (name, test) in &self.tests {
             let Some(Err(expected)) = test.perturb.as_ref().map(|text| text.parse::<Perturbation>()) else { continue };
@@ -370,6 +388,18 @@ mod tests {
         assert!(open(&TEXT.replace("seeds = 2", "seed = 2")).unwrap_err().contains("seed"));
         let error = open(&TEXT.replace("seeds = 2", "seeds = 2\nfirst_seed = 3")).unwrap_err();
         assert_eq!(error, "key `cells[0].first_seed`: expected 1 to the last seed, 2, found 3");
+        let other = "[tests.other]\ntask = \"Lift\"\nepisodes = 5\nseed_start = 50000\n";
+        let compared = |test: &str| {
+            format!(
+                "{TEXT}{other}[[comparisons]]\nquestion = \"?\"\nfirst = \"act\"\nsecond = \"act\"\ndata = \"lift\"\n\
+                 test = \"{test}\"\n"
+            )
+        };
+        open(&compared("lift")).unwrap();
+        assert_eq!(
+            open(&compared("other")).unwrap_err(),
+            "key `comparisons[0]`: expected arms, demonstrations and a test that a cell has, found act on lift, test other"
+        );
     }
 
     #[test]
@@ -387,7 +417,7 @@ mod tests {
         );
         assert_eq!(words("{ steps = 6, intervene = \"shuffle\" }").unwrap(), "6 steps, reasoning of another episode");
         let starts = "{ steps = 6, starts = { count = 8, noise = 0.5 } }";
-        assert_eq!(words(starts).unwrap(), "6 steps, best of 8 thoughts, noise 0.5");
+        assert_eq!(words(starts).unwrap(), "6 steps, best of 8 samples, noise 0.5");
         assert!(open(&with("{ step = 1 }")).unwrap_err().contains("step"));
         // a test as trained keeps its text
         assert!(!serde_json::to_string(&open(TEXT).unwrap().tests["lift"]).unwrap().contains("thinking"));

@@ -1,6 +1,7 @@
 //! The page of a study: made of its committed results and of nothing else.
 
 mod charts;
+mod overview;
 mod probes;
 #[cfg(test)]
 mod tests;
@@ -14,6 +15,7 @@ use zoo::ZooError;
 
 pub use self::charts::robot_charts;
 use self::charts::{all_arms, by_arm, by_cost, by_steps, shown};
+use self::overview::{apart, overview};
 use self::probes::probes;
 use super::cells::cells;
 use super::file::{Comparison, Data, Study};
@@ -41,6 +43,26 @@ fn read_results(study: &Study) -> Result<Results, ZooError> {
     Ok(results)
 }
 
+/// Refuses a comparison of groups that no stored episode of its test has.
+fn check_groups(study: &Study, results: &Results) -> Result<(), ZooError> {
+    for (i, comparison) in study.comparisons.iter().enumerate() {
+        let of_test = results.iter().filter(|((test, ..), _)| *test == comparison.test);
+        let episodes: Vec<_> =
+            of_test.flat_map(|(_, trainings)| trainings.values()).flat_map(|r| &r.episodes).collect();
+        let there: BTreeSet<&str> = episodes.iter().filter_map(|episode| episode.group.as_deref()).collect();
+        let unknown = comparison.groups.iter().find(|group| !there.contains(group.as_str()));
+        if let Some(group) = unknown.filter(|_| !episodes.is_empty()) {
+            let names: Vec<&str> = there.into_iter().collect();
+            return Err(ZooError::InvalidValue {
+                key: format!("comparisons[{i}].groups"),
+                expected: if names.is_empty() { "none".to_owned() } else { format!("some of {}", names.join(", ")) },
+                found: group.clone(),
+            });
+        }
+    }
+    Ok(())
+}
+
 /// Part of a page that is shown when its title is clicked.
 fn folded(text: &mut String, title: &str, part: &str) {
     // HTML shows no Markdown
@@ -55,6 +77,7 @@ fn folded(text: &mut String, title: &str, part: &str) {
 /// A result that cannot be read.
 pub fn robot_page(study: &Study, file: &Path) -> Result<String, ZooError> {
     let results = read_results(study)?;
+    check_groups(study, &results)?;
     let charts = by_arm(study, &results);
     let mut text = format!("# {}\n\n", study.title);
     if !study.verdict.is_empty() {
@@ -83,28 +106,20 @@ pub fn robot_page(study: &Study, file: &Path) -> Result<String, ZooError> {
         );
     }
     for (name, test) in tests {
-        for data in study.data.keys() {
-            let of_test: Vec<(&String, &Trainings)> = study
-                .arms
-                .keys()
-                .filter_map(|arm| Some((arm, results.get(&(name.clone(), data.clone(), arm.clone()))?)))
-                .collect();
-            if of_test.is_empty() {
-                continue;
-            }
-            let source = &study.data[data];
+        let of_data = |data: &String| -> Vec<(&String, &Trainings)> {
+            let of_arm = |arm| Some((arm, results.get(&(name.clone(), data.clone(), String::clone(arm)))?));
+            study.arms.keys().filter_map(of_arm).collect()
+        };
+        let head = |source: &Data| format!("{} demonstrations of {}{}", source.episodes, source.task, source.words());
+        let there = study.data.iter().filter(|(data, _)| !of_data(data).is_empty());
+        let headed: Vec<(&str, String)> = there.map(|(data, source)| (data.as_str(), head(source))).collect();
+        for ((data, head), mark) in headed.iter().zip(apart(study, &headed)) {
+            let of_test = of_data(&(*data).to_owned());
             for (_, chart) in charts.iter().filter(|((test, of), _)| test == name && of == data) {
                 let _ = writeln!(text, "{}", shown(study, chart));
             }
-            let title = format!(
-                "{}: {} demonstrations of {}{}; seeds {} to {}",
-                test.task,
-                source.episodes,
-                source.task,
-                source.words(),
-                test.seed_start,
-                test.seed_start + test.episodes - 1
-            );
+            let last = test.seed_start + test.episodes - 1;
+            let title = format!("{}: {head}{mark}; seeds {} to {last}", test.task, test.seed_start);
             let mut part = String::new();
             table(&mut part, study, &of_test);
             folded(&mut text, &title, &part);
@@ -141,68 +156,6 @@ pub fn robot_page(study: &Study, file: &Path) -> Result<String, ZooError> {
         text.pop();
     }
     Ok(text)
-}
-
-/// Arms against demonstrations, where an arm was meant for several: success on the first test of each.
-fn overview(text: &mut String, study: &Study, results: &Results) {
-    let mut columns: Vec<(&str, &str)> = Vec::new();
-    let mut rows: Vec<&str> = Vec::new();
-    let mut planned: BTreeMap<(&str, &str), u64> = BTreeMap::new();
-    for row in &study.cells {
-        let Some(test) = row.tests.iter().find(|test| study.tests[*test].is_plain()) else { continue };
-        if !columns.iter().any(|(data, _)| *data == row.data) {
-            columns.push((&row.data, test));
-        }
-        for arm in &row.arms {
-            if !rows.contains(&arm.as_str()) {
-                rows.push(arm);
-            }
-            let seeds = planned.entry((arm, &row.data)).or_default();
-            *seeds = row.seeds.max(*seeds);
-        }
-    }
-    columns.retain(|(data, test)| results.keys().any(|(of, its, _)| of == test && its == data));
-    let several = rows.iter().any(|arm| planned.keys().filter(|(planned, _)| planned == arm).count() > 1);
-    if !several {
-        return;
-    }
-    let head = |(data, _): &(&str, &str)| {
-        let Data { task, episodes, expert, skill, .. } = &study.data[*data];
-        let alone = columns.iter().filter(|(other, _)| study.data[*other].task == *task).count() == 1;
-        let expert = expert.as_ref().map(|expert| format!(", {expert}")).unwrap_or_default();
-        let skill = if skill.is_good() { String::new() } else { format!(", {skill}") };
-        if alone { format!("{task}{expert}{skill}") } else { format!("{task}, {episodes}{expert}{skill}") }
-    };
-    let heads: Vec<String> = columns.iter().map(head).collect();
-    // others of the same kind: their name tells them apart
-    let twice = |head: &String| heads.iter().filter(|other| *other == head).count() > 1;
-    let named = |(head, (data, _)): (&String, &(&str, &str))| {
-        if twice(head) { format!("{head}, {data}") } else { head.clone() }
-    };
-    let heads: Vec<String> = heads.iter().zip(&columns).map(named).collect();
-    let _ = writeln!(
-        text,
-        "## Success\n\nSuccess with its 95% interval over trainings and episodes, and the number of trainings.\n\n| | {} |\n|---|{}",
-        heads.join(" | "),
-        "---|".repeat(heads.len())
-    );
-    let ran = |arm: &&str| results.keys().any(|(_, _, of)| of == arm);
-    for arm in rows.into_iter().filter(ran) {
-        let cell = |(data, test): &(&str, &str)| {
-            let Some(&seeds) = planned.get(&(arm, *data)) else { return "-".to_owned() };
-            let key = ((*test).to_owned(), (*data).to_owned(), arm.to_owned());
-            let Some(trainings) = results.get(&key) else { return "-".to_owned() };
-            let estimate = over_trainings(&outcomes(trainings, &[]));
-            let estimate = estimate.as_ref().map_or_else(|| "-".to_owned(), percent);
-            match trainings.len() as u64 {
-                there if there == seeds => format!("{estimate}, {seeds}"),
-                there => format!("{estimate}, {there} of {seeds}"),
-            }
-        };
-        let cells: Vec<String> = columns.iter().map(cell).collect();
-        let _ = writeln!(text, "| {} | {} |", study.arms[arm].label, cells.join(" | "));
-    }
-    text.push('\n');
 }
 
 /// Whether the episode counts for `group`; `None` is all of them.
@@ -289,7 +242,10 @@ fn other_refinement(text: &mut String, study: &Study, results: &Results) {
          early stopping, or with their latent reasoning frozen or taken from another episode. Where several thoughts begin from noise, the \
          halting head chooses one.\n"
     );
-    for ((task, data), mut rows) in rows {
+    let head = |task: &str, data: &str| format!("{task} after {} demonstrations", study.data[data].episodes);
+    let headed: Vec<(&str, String)> = rows.keys().map(|(task, data)| (*data, head(task, data))).collect();
+    let marks = apart(study, &headed);
+    for (((task, data), mut rows), ((_, head), mark)) in rows.into_iter().zip(headed.into_iter().zip(marks)) {
         rows.sort_by_key(|(arm, _, trainings)| {
             let thinking = trainings.values().next().map(|result| result.test_definition.thinking).unwrap_or_default();
             (*arm, thinking.intervene.map(|i| i.name()), thinking.starts.map(|starts| starts.count), thinking.steps)
@@ -325,7 +281,7 @@ fn other_refinement(text: &mut String, study: &Study, results: &Results) {
         for (_, chart) in by_steps(study, results).iter().filter(|((of, its), _)| of == task && its == data) {
             let _ = writeln!(text, "{}", shown(study, chart));
         }
-        folded(text, &format!("{task} after {} demonstrations", study.data[data].episodes), &part);
+        folded(text, &(head + &mark), &part);
     }
 }
 
@@ -443,11 +399,10 @@ fn compare<'a>(study: &'a Study, results: &Results, stage: u8) -> Vec<Compared<'
     let mut found: Vec<Compared<'_>> = Vec::new();
     for comparison in study.comparisons.iter().filter(|c| c.stage == stage) {
         let c = comparison;
-        let side = |arm: &String, data: &String| {
+        let [first, second] = c.sides().map(|(arm, data)| {
             results.get(&(c.test.clone(), data.clone(), arm.clone())).map(|trainings| outcomes(trainings, &c.groups))
-        };
-        let second = side(&c.second, c.second_data.as_ref().unwrap_or(&c.data));
-        let Some((a, b)) = side(&c.first, &c.data).zip(second) else { continue };
+        });
+        let Some((a, b)) = first.zip(second) else { continue };
         let mean = |side: &[Vec<f64>]| {
             let all = side.concat();
             all.iter().sum::<f64>() / all.len().max(1) as f64
@@ -467,12 +422,10 @@ fn compare<'a>(study: &'a Study, results: &Results, stage: u8) -> Vec<Compared<'
 impl Compared<'_> {
     /// The names of both sides.
     fn sides(&self, study: &Study) -> [String; 2] {
-        let c = self.comparison;
-        let side = |arm: &String, data: &String| match &c.second_data {
+        self.comparison.sides().map(|(arm, data)| match &self.comparison.second_data {
             Some(_) => format!("{} ({data})", study.arms[arm].label),
             None => study.arms[arm].label.clone(),
-        };
-        [side(&c.first, &c.data), side(&c.second, c.second_data.as_ref().unwrap_or(&c.data))]
+        })
     }
 
     fn answer(&self, study: &Study) -> String {
@@ -533,8 +486,8 @@ fn p_text(p: f64) -> String {
 }
 
 fn costs(text: &mut String, study: &Study, results: &Results) {
-    let mut part = "Medians over the trainings of an arm, on a machine that also did other work. MFLOP: millions of floating-point \
-                    operations in the matrix products of a query with the largest number of refinement steps.\n\n\
+    let mut part = "Medians over all results of an arm on plain tests, on a machine that also did other work. MFLOP: millions of \
+                    floating-point operations in the matrix products of a query with the largest number of refinement steps.\n\n\
                     | arm | experiment | settings | parameters | steps | minutes | query, ms | MFLOP |\n|---|---|---|---|---|---|---|---|\n"
         .to_owned();
     for (name, arm) in &study.arms {

@@ -91,6 +91,9 @@ fn weights(entry: &EntryMeta) -> Option<String> {
 }
 
 impl CellResult {
+    /// The form that this program writes.
+    const FORMAT: u32 = 1;
+
     /// The result of `evaluation`.
     pub(super) fn new(
         cell: &Cell,
@@ -105,7 +108,7 @@ impl CellResult {
         times.sort_by(f64::total_cmp);
         let record = &evaluation.record;
         Self {
-            format: 1,
+            format: Self::FORMAT,
             arm: cell.arm.clone(),
             arm_definition: arm.clone(),
             data: cell.data.clone(),
@@ -183,8 +186,11 @@ impl CellResult {
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
             Err(source) => return Err(ZooError::Io { operation: "read", path: path.to_owned(), source }),
         };
-        let result = serde_json::from_str(&text)
-            .map_err(|source| ZooError::Malformed { path: path.to_owned(), reason: source.to_string() })?;
+        let malformed = |reason: String| ZooError::Malformed { path: path.to_owned(), reason };
+        let result: Self = serde_json::from_str(&text).map_err(|e| malformed(e.to_string()))?;
+        if result.format != Self::FORMAT {
+            return Err(malformed(format!("format: expected {}, found {}", Self::FORMAT, result.format)));
+        }
         Ok(Some(result))
     }
 

@@ -6,6 +6,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use analysis::depth::thinking_subject;
+use models::actrm::Thinking;
 use recording::{CollectEnd, CollectOptions, collect};
 use report::shell_quoted;
 use rollout::{Pool, PoolOptions, Python, WorkerSpec, harness_folder};
@@ -178,7 +179,7 @@ fn complete(request: &RobotStudyRequest, cell: &Cell, missing: &[String]) -> Res
         let data = &request.study.data[&cell.data];
         let Some(entry) = request.trained(&experiment.entry, &result.settings, data)? else { continue };
         let query_flops = match result.query_flops {
-            None => entry.load()?.model().query_flops(),
+            None => query_flops(&entry.load()?, &result.test_definition.thinking)?,
             counted => counted,
         };
         let complete = CellResult { query_flops, ..result.clone() }.with_weights_of(entry.meta());
@@ -187,6 +188,12 @@ fn complete(request: &RobotStudyRequest, cell: &Cell, missing: &[String]) -> Res
         }
     }
     Ok(())
+}
+
+/// Floating-point operations of a query of `entry` that thinks as `thinking` says, as long as it may.
+fn query_flops(entry: &LoadedEntry, thinking: &Thinking) -> Result<Option<f64>, ZooError> {
+    let thoughts = thinking.starts.map_or(1, |starts| starts.count) as f64;
+    Ok(entry.thinking(thinking)?.model().query_flops().map(|flops| flops * thoughts))
 }
 
 /// The experiment of a cell, under the name of its entry, and the hash of what it depends on.
@@ -369,8 +376,7 @@ impl Shared<'_> {
                 return Ok(CellEnd::Stopped);
             };
             let of_test = (test.as_str(), definition);
-            let thoughts = definition.thinking.starts.map_or(1, |starts| starts.count) as f64;
-            let flops = entry.thinking(&definition.thinking)?.model().query_flops().map(|flops| flops * thoughts);
+            let flops = query_flops(&entry, &definition.thinking)?;
             let result =
                 CellResult::new(cell, (arm, data), of_test, settings.clone(), flops, stored.meta(), &evaluation);
             result.write(&study.results.join(cell.file_name(&test)))?;

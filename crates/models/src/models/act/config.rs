@@ -6,7 +6,7 @@ use nn::Size;
 use nn::{ModelError, Result};
 use serde::{Deserialize, Serialize};
 
-/// ACT's options; defaults are LeRobot's.
+/// ACT's options. The defaults here are LeRobot's; `configs/policy/act.toml` has those of our experiments.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Config {

@@ -15,11 +15,14 @@
 //! Images are tokens after all others, one a cell of a feature map (`encoders`), in the order of the cameras; as in
 //! LeRobot nothing tells cameras apart.
 //!
-//! With `pointer` (ours) the encoder's output is asked which entity a demonstration took, and the decoder reads that entity's
-//! token as one more; the answer has a loss of its own. With `auxiliary` (ours) training asks the encoder's output for numbers
-//! that are not seen.
+//! `pointer` (ours): a classification head over the entity tokens after the encoder, trained with cross-entropy on the entity that
+//! the demonstration took. The decoder also attends to the softmax-weighted mean of those tokens. `auxiliary` (ours): a regression
+//! head on the first encoder token, trained on `data.auxiliary_keys`, which the policy does not observe.
 //!
-//! Deviations: none in the maths. `feedforward_activation = "glu"` is refused: LeRobot accepts it in its configuration,
+//! Shapes: b rows of a batch, C actions of a chunk (`action_horizon`), A dimensions of an action, L width of the latent, M tokens
+//! of the encoder, D width of a token (`dim_model`).
+//!
+//! Deviations: without entities, `pointer` and `auxiliary` none in the maths. `feedforward_activation = "glu"` is refused: LeRobot accepts it in its configuration,
 //! but its layer then cannot run (`glu` halves the width that `linear2` expects).
 //!
 //! Exact savings over LeRobot: of the VAE encoder's last layer only the first token is computed, because nothing else is read;
@@ -137,7 +140,8 @@ impl Act {
         self.vae.as_ref().map(|vae| vae.apply(cx, batch, &self.vae_encoder_pos_enc)).transpose()
     }
 
-    /// latent: (b, L), the features of the observation -> (b, C, A), the encoder's output, and the pointer's scores
+    /// latent (b, L), and the features of the observation -> actions (b, C, A), the encoder's output (b, M, D), and the
+    /// pointer's scores (b, candidates)
     fn decode(
         &self,
         cx: &mut Context<'_>,
@@ -158,8 +162,8 @@ impl Act {
         Ok((linear(cx, &decoded, &self.action_head)?, memory, scores))
     }
 
-    /// L1 over valid steps plus weighted KL, with a pointer cross-entropy, and what `auxiliary` asks; noise of the latent's
-    /// sample: (b, L).
+    /// L1 over valid steps plus weighted KL; with a pointer its cross-entropy, with `auxiliary` its regression loss. `noise` of
+    /// the latent's sample: (b, L).
     fn loss_with(&self, cx: &mut Context<'_>, batch: &Batch, noise: &Value) -> Result<Loss> {
         let latent = self.encode(cx, batch)?;
         let sample = match &latent {

@@ -36,7 +36,7 @@ impl Over {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct WarmStart {
-    /// Standard deviation of the noise on the previous answer, from which half of each batch starts in training (normalised units).
+    /// Standard deviation of the noise on the observation from whose answer half of each batch starts in training (normalised units).
     #[serde(default = "default_noise")]
     pub noise: f64,
 }

@@ -72,7 +72,7 @@ impl Config {
     /// The configuration of a model with the same weights that thinks otherwise.
     ///
     /// # Errors
-    /// No steps; halting together with an intervention; a threshold of halting that is none or without it; fewer than two
+    /// No steps; an intervention or starts beside a warm start; halting together with an intervention; a threshold of halting that is none or without it; fewer than two
     /// starts, noise that is not positive, starts together with an intervention or over the memory.
     pub fn thinking(&self, thinking: &Thinking) -> Result<Self> {
         let mut config = self.clone();
@@ -80,6 +80,12 @@ impl Config {
         if thinking.halting == Some(true) && thinking.intervene.is_some() {
             let (found, expected) = ("true".to_string(), "false with an intervention".to_string());
             return Err(ModelError::Config { model: "actrm", field: "thinking.halting", found, expected });
+        }
+        let tampered =
+            [("thinking.intervene", thinking.intervene.is_some()), ("thinking.starts", thinking.starts.is_some())];
+        if let Some((field, _)) = tampered.into_iter().find(|(_, given)| *given && reasoning.warm_start.is_some()) {
+            let (found, expected) = ("with a warm start".to_string(), "a policy without a warm start".to_string());
+            return Err(ModelError::Config { model: "actrm", field, found, expected });
         }
         if let Some(starts) = thinking.starts {
             let wrong = |field, found: String, expected: &str| {
@@ -97,6 +103,8 @@ impl Config {
             if reasoning.over == Over::Memory {
                 return wrong("thinking.starts", "over memory".to_string(), "reasoning over actions or tokens");
             }
+            // several thoughts run without a clock
+            reasoning.budget_ms = None;
         }
         if thinking.steps.is_some() {
             (reasoning.max_steps, reasoning.budget_ms) = (thinking.steps, None);

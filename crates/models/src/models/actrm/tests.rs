@@ -446,6 +446,15 @@ fn a_trained_policy_can_be_asked_to_think_otherwise() {
     let both = Thinking { halting: Some(true), intervene: Some(Intervention::Freeze), ..Thinking::default() };
     assert!(config.thinking(&both).unwrap_err().to_string().contains("thinking.halting"));
     assert!(config.thinking(&Thinking { steps: Some(0), ..Thinking::default() }).is_err());
+    // several thoughts run without a clock; no intervention and no start goes with a warm start
+    let starts = Thinking { starts: Some(Starts { count: 3, noise: 1.0 }), ..Thinking::default() };
+    assert_eq!((of(&starts).budget_ms, of(&starts).halt_threshold), (None, config.reasoning.halt_threshold));
+    let warm = small(ReasoningConfig { warm_start: Some(WarmStart { noise: 0.1 }), ..ReasoningConfig::default() });
+    for intervene in [None, Some(Intervention::Freeze)] {
+        let tampered = Thinking { intervene, starts: starts.starts.filter(|_| intervene.is_none()), ..starts };
+        let error = warm.thinking(&tampered).unwrap_err().to_string();
+        assert!(error.contains("without a warm start"), "{error}");
+    }
     let early = Thinking {
         halting: Some(true),
         halt_threshold: Some(0.6),

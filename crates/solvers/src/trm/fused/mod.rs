@@ -192,3 +192,32 @@ impl CustomOp2 for Recorded {
         Ok((Some(d_embedded), Some(d_flat)))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use nn::Rng;
+
+    #[test]
+    fn the_number_of_threads_changes_no_bit_of_the_forward_pass() {
+        for mixing in [Mixing::Attention, Mixing::MlpT, Mixing::Conv] {
+            let sizes = Config { num_heads: 2, inner_size: Some(10), ..Config::new(5, 6, 8) };
+            let config = Config { mixing, grid: Some([2, 3]), ..sizes };
+            let plan = Recursion::new(&config, None).unwrap().plan;
+            let mut rng = Rng::new(1, "threads");
+            let weights: Vec<f32> = rng.normals(plan.weights_len()).into_iter().map(|x| 0.3 * x).collect();
+            let packs = plan.pack(&weights, Direction::Forward);
+            // two groups and one puzzle more: three jobs
+            let numbers = (2 * plan.group() + 1) * plan.len * plan.dim;
+            let [z_h, z_l, embedded] = [(); 3].map(|()| rng.normals(numbers));
+            let run = |threads| {
+                let (mut h, mut l) = (z_h.clone(), z_l.clone());
+                plan.run(&packs, (&mut h, &mut l, &embedded), (2, 3), threads);
+                [h, l].concat().into_iter().map(f32::to_bits).collect::<Vec<u32>>()
+            };
+            let one = run(1);
+            assert!(one == run(2) && one == run(3), "{mixing:?}");
+        }
+    }
+}

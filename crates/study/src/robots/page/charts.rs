@@ -10,7 +10,7 @@ use report::statistics::{Estimate, over_trainings};
 use zoo::ZooError;
 
 use super::super::file::Study;
-use super::{Results, Trainings, outcomes, read_results};
+use super::{Results, Trainings, apart, outcomes, read_results};
 use crate::charts::{COLORS, escaped, intervals};
 
 /// Groups of episodes that make a line worth drawing.
@@ -48,12 +48,19 @@ pub(super) fn shown(study: &Study, chart: &Chart) -> String {
 /// Success of every arm on every plain test, with its 95% interval: a row each.
 pub(super) fn all_arms(study: &Study, results: &Results) -> Option<Chart> {
     let mut rows: Vec<(String, Vec<(String, Estimate)>)> = Vec::new();
-    for ((test, data, arm), trainings) in results.iter().filter(|((test, _, _), _)| study.tests[test].is_plain()) {
-        let Some(estimate) = over_trainings(&outcomes(trainings, &[])) else { continue };
+    let plain: Vec<_> = results.iter().filter(|((test, _, _), _)| study.tests[test].is_plain()).collect();
+    let head = |test: &str, data: &str| {
         let of = &study.data[data];
         let expert = of.expert.as_ref().map(|expert| format!(", {expert}")).unwrap_or_default();
         let skill = if of.skill.is_good() { String::new() } else { format!(", {}", of.skill) };
-        let head = format!("{} ({} demonstrations{expert}{skill})", study.tests[test].task, of.episodes);
+        format!("{} ({} demonstrations{expert}{skill}", study.tests[test].task, of.episodes)
+    };
+    let headed: Vec<(&str, String)> =
+        plain.iter().map(|((test, data, _), _)| (data.as_str(), head(test, data))).collect();
+    let marks = apart(study, &headed);
+    for (((_, _, arm), trainings), ((_, head), mark)) in plain.into_iter().zip(headed.into_iter().zip(marks)) {
+        let Some(estimate) = over_trainings(&outcomes(trainings, &[])) else { continue };
+        let head = format!("{head}{mark})");
         match rows.last_mut().filter(|(last, _)| *last == head) {
             Some((_, arms)) => arms.push((study.arms[arm].label.clone(), estimate)),
             None => rows.push((head, vec![(study.arms[arm].label.clone(), estimate)])),
@@ -98,7 +105,8 @@ pub(super) fn by_steps(study: &Study, results: &Results) -> Vec<((String, String
     for ((test, data, arm), trainings) in results {
         let test = &study.tests[test];
         let steps = test.thinking.steps;
-        if let Some(steps) = steps.filter(|_| test.thinking == Thinking { steps, ..Thinking::default() }) {
+        let alone = test.perturb.is_none() && test.thinking == Thinking { steps, ..Thinking::default() };
+        if let Some(steps) = steps.filter(|_| alone) {
             arms.entry((&test.task, data, arm)).or_default().insert(steps, trainings);
         }
     }

@@ -91,12 +91,12 @@ fn arms_of_several_tasks_stand_in_one_table() {
         "experiment = \"actrm_pickchain\"\n        label = \"one",
         "experiment = \"act_{data}\"\n        label = \"one",
     ) + "[data.lift]\ntask = \"Lift\"\nepisodes = 200\n[tests.lift]\ntask = \"Lift\"\nepisodes = 4\nseed_start = 40000\n\
-           [[cells]]\narms = [\"one\"]\ndata = \"lift\"\nseeds = 3\ntests = [\"lift\"]\n";
+           [[cells]]\narms = [\"one\"]\ndata = \"lift\"\nfirst_seed = 2\nseeds = 4\ntests = [\"lift\"]\n";
     std::fs::write(&file, text).unwrap();
     // a changed definition makes other results of them
     let ran = || {
         let study = Study::open(&file).unwrap();
-        for cell in cells(&study).iter().filter(|cell| cell.arm == "one" && cell.seed < 3) {
+        for cell in cells(&study).iter().filter(|cell| cell.arm == "one" && cell.seed < 4) {
             for test in &cell.tests {
                 result(&study, cell, test, [true; 4]).write(&folder.path().join(cell.file_name(test))).unwrap();
             }
@@ -132,11 +132,10 @@ fn arms_of_several_tasks_stand_in_one_table() {
     // and who showed them
     let others =
         std::fs::read_to_string(&file).unwrap().replace("episodes = 25", "episodes = 25\nexpert = \"careful\"");
-    let compared = "[[comparisons]]\nquestion = \"Better?\"\nfirst = \"one\"\nsecond = \"one\"\ndata = \"lift\"\n\
-                    second_data = \"chain\"\ntest = \"t\"\n";
-    std::fs::write(&file, others + compared).unwrap();
+    std::fs::write(&file, others).unwrap();
     let page = robot_page(&ran(), &file).unwrap();
     assert!(page.contains("| | PickChain, 200 | PickChain, 25, careful |\n"), "{page}");
+    assert!(!page.contains("Do they help"), "one of its sides has no result: {page}");
     let shown = std::fs::read_to_string(&file).unwrap().replace("expert = \"careful\"", "skill = \"mixed\"");
     std::fs::write(&file, &shown).unwrap();
     let study = ran();
@@ -147,8 +146,74 @@ fn arms_of_several_tasks_stand_in_one_table() {
     let error = format!("{:?}", Study::open(&file).unwrap_err());
     assert!(error.contains("careless"), "{error}");
     std::fs::write(&file, shown).unwrap();
-    // one of its sides has no result of that test
-    assert!(!page.contains("Better?"), "{page}");
+}
+
+#[test]
+fn demonstrations_of_one_kind_are_told_apart_and_arms_of_one_label_share_a_row() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("study.toml");
+    let text = STUDY.replace("RESULTS", &folder.path().display().to_string())
+        + "[data.chain-new]\ntask = \"PickChain\"\nepisodes = 200\nseed = 2\n[arms.new]\n\
+           experiment = \"actrm_pickchain\"\nlabel = \"one step\"\n[[cells]]\narms = [\"new\", \"six\"]\n\
+           data = \"chain-new\"\nseeds = 2\ntests = [\"t\", \"t-32\"]\n";
+    std::fs::write(&file, &text).unwrap();
+    let run = || {
+        let study = Study::open(&file).unwrap();
+        for cell in &cells(&study) {
+            for test in &cell.tests {
+                result(&study, cell, test, [true; 4]).write(&folder.path().join(cell.file_name(test))).unwrap();
+            }
+        }
+        study
+    };
+    let study = run();
+    let page = robot_page(&study, &file).unwrap();
+    for there in [
+        "| | PickChain, 200 | PickChain, 200, collection seed 2 |\n|---|---|---|\n| one step | 100.0% [",
+        "<summary>PickChain: 200 demonstrations of PickChain; seeds",
+        "<summary>PickChain: 200 demonstrations of PickChain, collection seed 2; seeds",
+        "<summary>PickChain after 200 demonstrations</summary>",
+        "<summary>PickChain after 200 demonstrations, collection seed 2</summary>",
+    ] {
+        assert!(page.contains(there), "{there}\n---\n{page}");
+    }
+    let overview = page.split("## Trainings").next().unwrap();
+    assert_eq!(overview.matches("\n| one step |").count(), 1, "{page}");
+    let chart = &robot_charts(&study).unwrap()[0].1;
+    for there in [">PickChain (200 demonstrations)</text>", ">PickChain (200 demonstrations, collection seed 2)</text>"]
+    {
+        assert!(chart.contains(there), "{there}\n---\n{chart}");
+    }
+    // of the same seed as well, they go by their names
+    std::fs::write(&file, text.replace("episodes = 200\nseed = 2", "episodes = 200")).unwrap();
+    let page = robot_page(&run(), &file).unwrap();
+    assert!(page.contains("| | PickChain, 200, chain | PickChain, 200, chain-new |\n"), "{page}");
+    // with images they say so
+    let cameras = "cameras = { names = [\"agentview\"], size = 84, fast_render = true }";
+    std::fs::write(&file, text.replace("seed = 2", cameras)).unwrap();
+    let page = robot_page(&run(), &file).unwrap();
+    assert!(page.contains("| | PickChain, 200 | PickChain, 200, images |\n"), "{page}");
+    // both arms of the label have a result there
+    std::fs::write(&file, text.replace("[\"one\", \"six\"]", "[\"one\", \"new\", \"six\"]")).unwrap();
+    let page = robot_page(&run(), &file).unwrap();
+    let overview = page.split("## Trainings").next().unwrap();
+    assert_eq!(overview.matches("\n| one step |").count(), 2, "{page}");
+}
+
+#[test]
+fn a_comparison_of_groups_that_no_episode_has_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("study.toml");
+    let text = STUDY.replace("RESULTS", &folder.path().display().to_string());
+    std::fs::write(&file, text.replace("[\"4 hops\"]", "[\"3 hop\", \"4 hops\"]")).unwrap();
+    let study = Study::open(&file).unwrap();
+    robot_page(&study, &file).unwrap();
+    let cell = &cells(&study)[0];
+    result(&study, cell, "t", [true; 4]).write(&folder.path().join(cell.file_name("t"))).unwrap();
+    assert_eq!(
+        robot_page(&study, &file).unwrap_err().to_string(),
+        "key `comparisons[1].groups`: expected some of 3 hops, 4 hops, found 3 hop"
+    );
 }
 
 #[test]
@@ -220,7 +285,8 @@ fn progress_stands_where_every_episode_has_it() {
 fn charts_are_drawn_where_there_are_groups_enough_and_shown_where_they_lie() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("study.toml");
-    std::fs::write(&file, STUDY.replace("RESULTS", &folder.path().display().to_string())).unwrap();
+    std::fs::write(&file, STUDY.replace("RESULTS", &folder.path().display().to_string()).replace("4 hops", "0 hops"))
+        .unwrap();
     let study = Study::open(&file).unwrap();
     let write = |groups: usize| {
         for cell in cells(&study).iter().filter(|cell| cell.stage == 1) {
