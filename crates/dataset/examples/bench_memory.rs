@@ -17,6 +17,7 @@ use dataset::edit::{self, Destination, Parts, Selection};
 use dataset::shuffle::SplitMix64;
 use dataset::{Array, ConvertOptions, Demo, ImageForm, RobomimicWriter, WriteOptions, convert, isolation};
 use serde_json::json;
+use std::ops::ControlFlow;
 use std::path::Path;
 use std::process::{Command, ExitCode};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -120,6 +121,7 @@ fn low_dim(file: &Path, work: &Path, keep: bool) -> Result<ExitCode, AnyError> {
     let clear = || made.iter().for_each(|folder| drop(std::fs::remove_dir_all(folder)));
     clear();
     let [set, dropped, halves, merged] = &made;
+    let mut going = |_, _| ControlFlow::Continue(());
     let mut met = true;
     let mut measure = |name: &str, run: &mut dyn FnMut() -> Result<usize, AnyError>| -> Result<(), AnyError> {
         // the peak starts anew
@@ -141,11 +143,11 @@ fn low_dim(file: &Path, work: &Path, keep: bool) -> Result<ExitCode, AnyError> {
     measure("convert", &mut || Ok(convert(file, set, &options, &mut |_, _| {})?.frames))?;
     let chosen = Selection { episodes: vec![3], ..Selection::default() };
     let to = Destination::New(dropped.clone());
-    measure("drop", &mut || Ok(edit::without(set, &to, &chosen, &mut |_, _| {})?.frames))?;
+    measure("drop", &mut || Ok(edit::without(set, &to, &chosen, &mut going)?.frames))?;
     let parts = Parts::Fractions(vec![("a".to_owned(), 0.5), ("b".to_owned(), 0.5)]);
-    edit::split(set, halves, &parts, None, &mut |_, _| {})?;
+    edit::split(set, halves, &parts, None, &mut going)?;
     let sets = [halves.join("a"), halves.join("b")];
-    measure("merge", &mut || Ok(edit::merge(&sets, merged, &mut |_, _| {})?.frames))?;
+    measure("merge", &mut || Ok(edit::merge(&sets, merged, &mut going)?.frames))?;
     clear();
     if !keep {
         std::fs::remove_file(file)?;

@@ -35,18 +35,16 @@ pub use lerobot::{
     ACTION, ActionKind, ActionProvenance, CameraFile, Check, Column, ConvertOptions, ConvertReport, Dataset, DepthMaps,
     DepthUnit, ENTITY_PREFIX, ENVIRONMENT_STATE, EnvMeta, EpisodeMeta, ExportReport, Feature, Features, ImageForm,
     Info, MISTAKE, OldSet, PictureFile, PictureStore, Pictures, Provenance, RotationForm, STATE, Shard, ShardReport,
-    SkippedDemo, TIME_TOLERANCE, Texts, VideoEncoder, VideoOptions, VideoProvenance, convert, convert_shard,
-    convert_unless, edit, export, merge_shards, notes, rewrite, shard_files, source_hash, verify, verify_source,
-    verify_within,
+    SkippedDemo, TIME_TOLERANCE, Texts, VideoEncoder, VideoOptions, VideoProvenance, Wide, convert, convert_shard,
+    convert_unless, edit, export, merge_shards, notes, remove_unfinished, rewrite, shard_files, source_hash, verify,
+    verify_source, verify_within,
 };
 pub use plan::{DemoPlan, Dialect, Join, KeyPlan, Place, Plan, Problem};
 pub use puzzle_table::{PuzzleSet, write_puzzles};
 pub use samples::{NumberKind, SampleColumn, SamplePlace, SampleSpec, Samples};
 pub use sheet::Picture;
 pub use sorted_map::SortedMap;
-pub use source::{
-    NonFinite, RobomimicWriter, Source, VideoFile, VideoInfo, WriteOptions, isolation, remove_unfinished,
-};
+pub use source::{NonFinite, RobomimicWriter, Source, VideoFile, VideoInfo, WriteOptions, isolation};
 pub use stats::FeatureStats;
 pub use tree::{Array, Attrs, Demo, Dtype};
 pub use windows::{WindowBatch, WindowSpec, Windows};

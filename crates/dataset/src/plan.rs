@@ -1,6 +1,6 @@
 //! What is in a file or folder of demonstrations, before any of it is read.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
@@ -183,7 +183,8 @@ impl Plan {
 
     /// Demos that the source names and that cannot be opened at all, by id, and why.
     pub fn lost(&self) -> impl Iterator<Item = (&str, &InputError)> {
-        let lost = |p: &'_ &Problem| p.fatal && p.demo.as_ref().is_some_and(|id| self.position(id).is_none());
+        let positions = self.positions();
+        let lost = move |p: &'_ &Problem| p.fatal && p.demo.as_deref().is_some_and(|id| !positions.contains_key(id));
         self.problems.iter().filter(lost).filter_map(|p| Some((p.demo.as_deref()?, &p.error)))
     }
 
@@ -196,6 +197,31 @@ impl Plan {
                 && !demo.keys.contains_key(key)
         });
         found.map(|p| &p.error)
+    }
+
+    /// Datasets that some demos have and that cannot be read there, and what to say of each; `from` says where else they are
+    /// left out.
+    pub(crate) fn left_out(&self, from: &str) -> (Vec<String>, Vec<String>) {
+        let mut found: BTreeMap<&str, (usize, String)> = BTreeMap::new();
+        for demo in &self.demos {
+            let mine = |p: &&Problem| p.fatal && p.demo.as_ref().is_none_or(|id| *id == demo.id);
+            let keys: BTreeSet<&str> = self.problems.iter().filter(mine).filter_map(|p| p.key.as_deref()).collect();
+            for key in keys {
+                if let Some(error) = self.unreadable(demo, key) {
+                    found.entry(key).or_insert_with(|| (0, error.to_string())).0 += 1;
+                }
+            }
+        }
+        let demos = self.demos.len();
+        let note = |(key, (count, error)): (&&str, &(usize, String))| {
+            format!("{key} is left out in {count} of {demos} demos{from}: {error}")
+        };
+        (found.keys().map(|key| (*key).to_owned()).collect(), found.iter().map(note).collect())
+    }
+
+    /// Positions of the demos by id.
+    pub(crate) fn positions(&self) -> HashMap<&str, usize> {
+        self.demos.iter().enumerate().rev().map(|(at, demo)| (demo.id.as_str(), at)).collect()
     }
 
     /// Position of the demo with this id.

@@ -1,6 +1,6 @@
 //! The two tables and the answers.
 
-use dataset::Dataset;
+use dataset::{Dataset, DatasetError, Wide};
 use polars::prelude::{
     AnyValue, Column as Series, DataFrame, IntoColumn, IntoLazy, NamedFrom, PolarsError, Series as Values,
 };
@@ -17,7 +17,7 @@ pub enum QueryError {
         /// The statement.
         sql: String,
         /// The engine's words.
-        source: PolarsError,
+        source: Words,
     },
     /// A statement that changes something, or is none.
     #[error(
@@ -35,8 +35,22 @@ pub enum QueryError {
         /// Its name.
         table: &'static str,
         /// The engine's words.
-        source: PolarsError,
+        source: Words,
     },
+    /// The data set's files could not be read.
+    #[error(transparent)]
+    Files(#[from] DatasetError),
+}
+
+/// The engine's words, in a line.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+pub struct Words(String);
+
+impl From<PolarsError> for Words {
+    fn from(error: PolarsError) -> Self {
+        Self(error.to_string().lines().next().unwrap_or_default().to_owned())
+    }
 }
 
 /// The answer to a query.
@@ -50,10 +64,12 @@ pub struct QueryResult {
 
 /// Both tables by name.
 fn both(dataset: &Dataset) -> Result<[(&'static str, DataFrame); 2], QueryError> {
-    let failed = |table| move |source| QueryError::Table { table, source };
+    let made = |table, columns: Vec<Series>, rows| {
+        DataFrame::new(rows, columns).map_err(|e| QueryError::Table { table, source: e.into() })
+    };
     Ok([
-        ("frames", frames(dataset).map_err(failed("frames"))?),
-        ("episodes", episodes(dataset).map_err(failed("episodes"))?),
+        ("frames", made("frames", frames(dataset)?, dataset.frames())?),
+        ("episodes", made("episodes", episodes(dataset), dataset.episodes().len())?),
     ])
 }
 
@@ -67,7 +83,7 @@ pub fn query(dataset: &Dataset, sql: &str) -> Result<QueryResult, QueryError> {
     if !["SELECT", "WITH", "SHOW", "EXPLAIN"].iter().any(|word| first.eq_ignore_ascii_case(word)) {
         return Err(QueryError::NoQuestion { sql: sql.to_owned(), found: first.to_owned() });
     }
-    let refused = |source: PolarsError| QueryError::Refused { sql: sql.to_owned(), source };
+    let refused = |error: PolarsError| QueryError::Refused { sql: sql.to_owned(), source: error.into() };
     let mut context = SQLContext::new();
     for (name, table) in both(dataset)? {
         context.register(name, table.lazy());
@@ -105,6 +121,8 @@ fn json(value: AnyValue<'_>) -> Value {
         AnyValue::Float64(v) => v.into(),
         AnyValue::String(s) => s.into(),
         AnyValue::StringOwned(s) => s.to_string().into(),
+        AnyValue::UInt64(v) => v.into(),
+        AnyValue::List(values) => values.iter().map(json).collect(),
         other => match other.extract::<i64>() {
             Some(v) => v.into(),
             None => other.to_string().into(),
@@ -147,26 +165,40 @@ fn named(mut name: String, taken: &mut BTreeSet<String>) -> String {
     name
 }
 
-fn frames(dataset: &Dataset) -> Result<DataFrame, PolarsError> {
+/// One dimension of a column.
+fn dimension<T: Copy>(all: &[T], d: usize, dim: usize) -> Vec<T> {
+    all.iter().skip(d).step_by(dim).copied().collect()
+}
+
+fn frames(dataset: &Dataset) -> Result<Vec<Series>, DatasetError> {
     let episodes = dataset.episodes();
     let total = dataset.frames();
     let mut episode_index = Vec::with_capacity(total);
     let mut frame_index = Vec::with_capacity(total);
-    let mut timestamp = Vec::with_capacity(total);
+    let (stored, single) = dataset.frame_times()?.unzip();
+    let known = dataset.frame_tasks()?;
+    let mut timestamp = stored.unwrap_or_default();
+    let timed = !timestamp.is_empty();
     let mut task = Vec::with_capacity(total);
     for episode in episodes {
         for i in 0..episode.length {
             episode_index.push(episode.index as i64);
             frame_index.push(i as i64);
-            timestamp.push(i as f64 / dataset.info().fps);
-            task.push(episode.tasks.first().cloned().unwrap_or_default());
+            if !timed {
+                timestamp.push(i as f64 / dataset.info().fps);
+            }
+            let own = known.as_ref().map(|tasks| &dataset.tasks()[tasks[episode.from + i]]);
+            task.push(own.or(episode.tasks.first()).cloned().unwrap_or_default());
         }
     }
     let mut columns = vec![
         column("episode_index", episode_index),
         column("frame_index", frame_index),
         column("index", (0..total as i64).collect::<Vec<i64>>()),
-        column("timestamp", timestamp),
+        match single {
+            Some(true) => column("timestamp", timestamp.iter().map(|&seconds| seconds as f32).collect::<Vec<f32>>()),
+            _ => column("timestamp", timestamp),
+        },
         column("task", task),
     ];
     let mut taken: BTreeSet<String> = columns.iter().map(|c| c.name().to_string()).collect();
@@ -175,6 +207,7 @@ fn frames(dataset: &Dataset) -> Result<DataFrame, PolarsError> {
         _ => format!("{}_{d}", plain(name)),
     };
     let known = || dataset.info().features.0.iter().filter_map(|(name, f)| Some((name, f, dataset.column(name)?)));
+    let wide = dataset.wide()?;
     // no number of one feature takes the name of another
     let reserved: BTreeSet<String> =
         known().flat_map(|(name, _, values)| (0..values.dim).map(move |d| own(name, values.dim, d))).collect();
@@ -184,17 +217,19 @@ fn frames(dataset: &Dataset) -> Result<DataFrame, PolarsError> {
             let free = |given: &String| values.dim > 1 && !taken.contains(given) && !reserved.contains(given);
             let unique = given.filter(free).unwrap_or_else(|| own(name, values.dim, d));
             let unique = named(unique, &mut taken);
-            let data: Vec<f32> = values.data.iter().skip(d).step_by(values.dim).copied().collect();
-            columns.push(match feature.dtype.as_str() {
-                "bool" => column(&unique, data.iter().map(|&v| v != 0.0).collect::<Vec<bool>>()),
-                _ => column(&unique, data),
+            let data = dimension(values.data, d, values.dim);
+            columns.push(match (wide.get(name), feature.dtype.as_str()) {
+                (Some(Wide::Doubles(all)), _) => column(&unique, dimension(all, d, values.dim)),
+                (Some(Wide::Longs(all)), _) => column(&unique, dimension(all, d, values.dim)),
+                (None, "bool") => column(&unique, data.iter().map(|&v| v != 0.0).collect::<Vec<bool>>()),
+                (None, _) => column(&unique, data),
             });
         }
     }
-    DataFrame::new(total, columns)
+    Ok(columns)
 }
 
-fn episodes(dataset: &Dataset) -> Result<DataFrame, PolarsError> {
+fn episodes(dataset: &Dataset) -> Vec<Series> {
     let episodes = dataset.episodes();
     let mut columns = vec![
         column("episode_index", episodes.iter().map(|e| e.index as i64).collect::<Vec<_>>()),
@@ -216,5 +251,5 @@ fn episodes(dataset: &Dataset) -> Result<DataFrame, PolarsError> {
         let inside = episodes.iter().map(|e| members.contains(&e.index)).collect::<Vec<bool>>();
         columns.push(column(&named(format!("in_{}", plain(name)), &mut taken), inside));
     }
-    DataFrame::new(episodes.len(), columns)
+    columns
 }

@@ -2,9 +2,14 @@
 
 #![allow(clippy::unwrap_used)]
 
+use arrow_array::{ArrayRef, Float32Array, Int64Array, RecordBatch, StringArray};
 use dataset::{ConvertOptions, Dataset, convert};
+use parquet::arrow::ArrowWriter;
+use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 use serde_json::json;
+use std::fs::File;
 use std::path::Path;
+use std::sync::Arc;
 
 fn set(dir: &Path) -> Dataset {
     let fixture = Path::new(env!("CARGO_MANIFEST_DIR")).join("../dataset/tests/fixtures/lift_low_dim_3_demos.hdf5");
@@ -61,15 +66,69 @@ fn no_number_takes_the_name_of_a_feature() {
     }
 }
 
+/// A set that another program wrote: times of a clock, nanoseconds, two tasks in an episode.
+#[test]
+fn numbers_times_and_tasks_are_those_of_the_frames() {
+    let dir = tempfile::tempdir().unwrap();
+    drop(set(dir.path()));
+    let root = dir.path().join("set");
+    std::fs::remove_dir_all(root.join("actrm")).unwrap();
+    let path = root.join("meta/info.json");
+    let mut info: serde_json::Value = serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
+    info["features"]["next.reward"]["dtype"] = json!("int64");
+    std::fs::write(&path, info.to_string()).unwrap();
+    let nanoseconds = |row: usize| 1_700_000_000_000_000_001 + row as i64;
+    rewrite(&root.join("data/chunk-000/file-000.parquet"), &|name, rows| -> Option<ArrayRef> {
+        match name {
+            "next.reward" => Some(Arc::new(Int64Array::from_iter_values((0..rows).map(nanoseconds)))),
+            "timestamp" => Some(Arc::new(Float32Array::from_iter_values((0..rows).map(|row| row as f32)))),
+            "task_index" => Some(Arc::new(Int64Array::from_iter_values((0..rows as i64).map(|row| row % 2)))),
+            _ => None,
+        }
+    });
+    rewrite(&root.join("meta/tasks.parquet"), &|name, _| -> Option<ArrayRef> {
+        match name {
+            "task_index" => Some(Arc::new(Int64Array::from(vec![0, 1]))),
+            _ => Some(Arc::new(StringArray::from(vec!["open", "close"]))),
+        }
+    });
+    let set = Dataset::open(&root).unwrap();
+    let rows = query::query(&set, "SELECT next_reward, timestamp, task FROM frames ORDER BY index LIMIT 2").unwrap();
+    let expected = [json!([nanoseconds(0), 0.0, "open"]), json!([nanoseconds(1), 1.0, "close"])];
+    assert_eq!(rows.rows.into_iter().map(serde_json::Value::from).collect::<Vec<_>>(), expected);
+    let lists = query::query(&set, "SELECT ARRAY_AGG(episode_index) AS all, COUNT(*) AS n FROM episodes").unwrap();
+    assert_eq!(lists.rows, [[json!([0, 1, 2]), json!(3)]]);
+}
+
+/// A Parquet file with some of its columns in other values.
+fn rewrite(path: &Path, column: &dyn Fn(&str, usize) -> Option<ArrayRef>) {
+    let reader = ParquetRecordBatchReaderBuilder::try_new(File::open(path).unwrap()).unwrap().with_batch_size(1 << 20);
+    let batch = reader.build().unwrap().next().unwrap().unwrap();
+    let schema = batch.schema();
+    let columns =
+        schema.fields().iter().zip(batch.columns()).map(|(field, old)| {
+            (field.name(), column(field.name(), batch.num_rows()).unwrap_or_else(|| Arc::clone(old)))
+        });
+    let batch = RecordBatch::try_from_iter(columns).unwrap();
+    let mut writer = ArrowWriter::try_new(File::create(path).unwrap(), batch.schema(), None).unwrap();
+    writer.write(&batch).unwrap();
+    writer.close().unwrap();
+}
+
 #[test]
 fn a_wrong_query_names_what_is_wrong() {
     let dir = tempfile::tempdir().unwrap();
     let set = set(dir.path());
-    for (sql, word) in [("SELECT nothing FROM frames", "nothing"), ("SELECT * FROM steps", "steps")] {
+    let cases = [
+        ("SELECT nothing FROM frames", "nothing"),
+        ("SELECT * FROM steps", "steps"),
+        ("SELECT length, length FROM episodes", "length"),
+    ];
+    for (sql, word) in cases {
         let error = query::query(&set, sql).unwrap_err();
         let source = std::error::Error::source(&error).unwrap().to_string();
         assert!(error.to_string().contains(sql), "{error}");
-        assert!(source.contains(word), "{source}");
+        assert!(source.contains(word) && !source.contains('\n'), "{source}");
     }
     for (sql, found) in [("hello", "\"hello\""), ("DROP TABLE frames", "\"DROP\""), ("", "\"\"")] {
         let error = query::query(&set, sql).unwrap_err().to_string();

@@ -3,11 +3,12 @@
 
 mod cameras;
 mod commands;
-mod parents;
 mod svg;
 mod view;
+mod work;
 
 use clap::{CommandFactory, Parser};
+use dataset::DatasetError;
 use std::process::ExitCode;
 
 /// Demonstrations for robot learning: look at them, collect them, convert them, check them.
@@ -25,7 +26,13 @@ fn main() -> ExitCode {
     // in a reading process this never returns
     dataset::isolation::serve_if_child();
     cli::completions::answer(command);
-    cli::end(cli::parse::<Cli>(command(), &|_, _| None).command.run())
+    let result = cli::parse::<Cli>(command(), &|_, _| None).command.run();
+    let error = result.as_ref().err().and_then(|error| error.downcast_ref::<DatasetError>());
+    if matches!(error, Some(DatasetError::Stopped { .. })) {
+        cli::note(work::STOPPED);
+        return ExitCode::from(cli::INTERRUPTED);
+    }
+    cli::end(result)
 }
 
 /// The command line, as its help shows it.

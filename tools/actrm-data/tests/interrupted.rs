@@ -69,6 +69,44 @@ fn killed_at_fifty_moments_it_leaves_all_or_nothing() {
     assert_eq!(names(dir.path()), ["in.hdf5", "set"]);
 }
 
+#[test]
+fn ctrl_c_at_any_moment_leaves_all_or_nothing() {
+    let dir = tempfile::tempdir().unwrap();
+    let (source, set, parent) = (dir.path().join("in.hdf5"), dir.path().join("set"), dir.path().join("made"));
+    std::fs::copy(fixture(), &source).unwrap();
+    assert!(convert(&source, &set).status().unwrap().success());
+    let mut rng = SplitMix64::new(5, 0);
+    let mut ended = 0;
+    for (command, from, out) in [("convert", &source, "out"), ("export", &set, "out.hdf5"), ("edit", &set, "out")] {
+        let out = parent.join(out);
+        let mut whole = 0;
+        for turn in 0..20 {
+            let start = Instant::now();
+            let mut child = Command::new(env!("CARGO_BIN_EXE_actrm-data"));
+            child.arg(command).args(if command == "edit" { &["drop", "--episodes", "0"][..] } else { &[] });
+            let mut child = child.arg(from).arg(&out).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
+            if turn == 0 {
+                child.wait().unwrap();
+                whole = start.elapsed().as_micros() as u64;
+            } else {
+                std::thread::sleep(Duration::from_micros(rng.below(whole)));
+                assert!(Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap().success());
+            }
+            let status = child.wait().unwrap();
+            if out.exists() {
+                assert_eq!(names(&parent), [out.file_name().unwrap().to_str().unwrap()], "{command}");
+                std::fs::remove_dir_all(&parent).unwrap();
+            } else {
+                // a program that has only just begun listens to nothing
+                assert!(matches!(status.code(), Some(130) | None), "{command}: {status}");
+                assert_eq!(names(dir.path()), ["in.hdf5", "set"], "{command}: {status}");
+                ended += usize::from(status.code() == Some(130));
+            }
+        }
+    }
+    assert!(ended >= 5, "only {ended} were ended while they worked");
+}
+
 /// Runs one of our commands that has no room for its output: it says so in one line, and `before` is all that is left.
 fn refused_without_room(dir: &Path, command: &mut Command, before: &[&str]) -> String {
     let output = command.output().unwrap();

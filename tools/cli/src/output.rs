@@ -1,7 +1,7 @@
 //! Writing to standard output and standard error.
 
 use std::io::{ErrorKind, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
 use serde::Serialize;
@@ -37,15 +37,29 @@ pub fn note(text: &str) {
     let _ = std::io::stderr().lock().write_all(line.as_bytes());
 }
 
+/// Folders that were made for an output. Those of them that are empty in the end are removed again.
+#[must_use = "folders that stay empty are removed when this is dropped"]
+pub struct Parents(Vec<PathBuf>);
+
 /// Makes the folders that a file or folder at `path` will be in.
 ///
 /// # Errors
 /// A folder that cannot be made.
-pub fn make_parent(path: &Path) -> Result<()> {
-    let parent = path.parent().filter(|parent| !parent.as_os_str().is_empty() && !parent.exists());
-    parent
-        .map_or(Ok(()), std::fs::create_dir_all)
-        .with_context(|| format!("cannot create the folder of {}", crate::shown(path)))
+pub fn make_parent(path: &Path) -> Result<Parents> {
+    let missing = |folder: &&Path| !folder.as_os_str().is_empty() && !folder.exists();
+    let made = Parents(path.ancestors().skip(1).take_while(missing).map(Path::to_path_buf).collect());
+    let folder = made.0.first().map_or(Ok(()), std::fs::create_dir_all);
+    folder.with_context(|| format!("cannot create the folder of {}", crate::shown(path)))?;
+    Ok(made)
+}
+
+impl Drop for Parents {
+    fn drop(&mut self) {
+        for folder in &self.0 {
+            // one that holds something stays
+            let _ = std::fs::remove_dir(folder);
+        }
+    }
 }
 
 /// `error: …` in one line.

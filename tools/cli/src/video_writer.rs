@@ -59,7 +59,7 @@ impl VideoWriter {
         let mut muxer = Muxer::new(u16::try_from(width)?, u16::try_from(height)?, rate);
         samples.iter().try_for_each(|sample| muxer.push(sample)).with_context(|| format!("video {shown}"))?;
         let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
-        crate::make_parent(&path)?;
+        let _parents = crate::make_parent(&path)?;
         let written = || -> std::io::Result<()> {
             let mut file = tempfile::Builder::new()
                 .prefix(".video-")

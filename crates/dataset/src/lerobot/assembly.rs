@@ -129,7 +129,7 @@ impl<'a> Assembly<'a> {
         let features = &head.info.features.0;
         let statistical: Vec<(String, bool)> = features.iter().map(|(name, f)| (name.clone(), f.is_visual())).collect();
         files.push(meta::write_tasks(root, &head.tasks)?);
-        files.push(meta::write_episodes(root, &head.tasks, &statistical, &told.rows, &told.each)?);
+        files.push(meta::write_episodes(root, &head.tasks, &statistical, &told.rows, &told.each, &[])?);
         files.push(meta::write_stats(root, &statistical, &told.stats)?);
         let mut info = head.info.clone();
         let mut skipped = Vec::new();

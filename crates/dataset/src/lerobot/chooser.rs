@@ -454,7 +454,11 @@ impl Chooser<'_> {
             Some(usual)
         };
         let fps = options.fps.or(stated).or_else(&mut default).ok_or_else(|| {
-            self.bad_rate("env_args", "env_kwargs.control_freq, or a rate given by hand (--fps)", "neither")
+            self.bad_rate(
+                "env_args",
+                "env_kwargs.control_freq, or a rate given to `actrm-data convert` (--fps)",
+                "neither",
+            )
         })?;
         self.checked(fps)
     }

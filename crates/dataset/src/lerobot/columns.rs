@@ -43,12 +43,12 @@ pub(super) fn read_columns(
         names.push("timestamp");
     }
     let mut casts: BTreeMap<&str, String> = BTreeMap::new();
-    let (mut late, mut strangers) = (Late::default(), BTreeSet::new());
+    let (mut late, mut unstated) = (Late::default(), BTreeSet::new());
     let (mut row, mut episode) = (0, 0);
     for path in read::files(root, "data")? {
         for field in read::open(&path)?.schema().fields().iter().filter(|_| owned) {
             if info.features.get(field.name()).is_none() {
-                strangers.insert(field.name().clone());
+                unstated.insert(field.name().clone());
             }
         }
         if names.is_empty() {
@@ -118,7 +118,7 @@ pub(super) fn read_columns(
         let dtype = info.features.get(name).map_or("", |feature| &feature.dtype);
         notes.push(format!("column {name}: expected {dtype}, as info.json says, found {found}: cast, as LeRobot does"));
     }
-    notes.extend(strangers.into_iter().map(|name| {
+    notes.extend(unstated.into_iter().map(|name| {
         let fate = match INDEX_COLUMNS.contains(&name.as_str()) {
             true => "`edit` writes a set that states it",
             false => "it is left out, with its values",

@@ -6,6 +6,7 @@
 use super::assembly::{Assembly, Encoders, Head, bytes_of};
 use super::depth;
 use super::doubts::Doubts;
+use super::edit;
 use super::encode::{GroupOutput, Job};
 use super::encoded;
 use super::features::{ConvertOptions, Mapping};
@@ -20,10 +21,10 @@ use super::videos;
 use super::work::{self, Part};
 use crate::error::{DatasetError, InputError, Result};
 use crate::ffmpeg;
-use crate::plan::{Plan, Problem};
+use crate::plan::Plan;
 use crate::source::Source;
 use crate::tree::Demo;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::ops::ControlFlow;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -144,13 +145,13 @@ pub(crate) fn without_observations(input: &Source) -> Result<()> {
 
 /// Task texts in order of first use, and each episode's.
 pub(crate) fn tasks(source: &Path, plan: &Plan) -> (Vec<String>, Vec<usize>) {
-    let mut tasks: Vec<String> = Vec::new();
+    let (mut tasks, mut numbers): (Vec<String>, HashMap<&String, usize>) = Default::default();
     let mut task_of = Vec::with_capacity(plan.demos.len());
     let stem = source.file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();
     for demo in &plan.demos {
         // no instruction: the environment names the task; a file that names none is known by its own name
         let text = demo.task.as_ref().or(plan.env_name.as_ref()).unwrap_or(&stem);
-        let index = tasks.iter().position(|t| t == text).unwrap_or_else(|| {
+        let index = *numbers.entry(text).or_insert_with(|| {
             tasks.push(text.clone());
             tasks.len() - 1
         });
@@ -209,11 +210,26 @@ impl Opened {
             return Ok(None);
         }
         let mut rest = self.input.root()?;
-        if let (false, Some(data)) = (self.skipped.is_empty(), rest.inner_attrs.get_mut("data")) {
+        if self.skipped.is_empty() {
+            return Ok(Some(rest));
+        }
+        if let Some(data) = rest.inner_attrs.get_mut("data") {
             side::count(data, "total", self.input.plan().frames());
             side::count(data, "num_demos", self.input.plan().demos.len());
         }
+        for (_, mask) in rest.datasets.iter_mut().filter(|(path, _)| path.starts_with("mask/")) {
+            let Some(ids) = mask.to_strings().filter(|_| mask.shape.len() == 1) else { continue };
+            let there: Vec<String> = ids.iter().filter(|id| !self.is_skipped(id)).cloned().collect();
+            if there.len() < ids.len() {
+                *mask = edit::texts_like(mask, &there);
+            }
+        }
         Ok(Some(rest))
+    }
+
+    /// Whether a demo was left out.
+    fn is_skipped(&self, demo: &str) -> bool {
+        self.skipped.iter().any(|skipped| skipped.demo == demo)
     }
 
     /// Reads and encodes row groups on several threads and hands them over in order, on this one. Gives what is to be noted
@@ -267,19 +283,24 @@ impl Opened {
     pub(super) fn head(&self, source: &Path, options: &ConvertOptions) -> Head {
         let plan = self.input.plan();
         let (tasks, task_of) = tasks(source, plan);
-        let (left_out, left_out_notes) = self.left_out(options.lossless);
+        let (left_out, left_out_notes) =
+            plan.left_out(if options.lossless { ", from the side folder too" } else { "" });
         let features = self.mapping.features();
         let films = features.0.iter().any(|(_, feature)| feature.dtype == "video");
+        let positions = plan.positions();
         // demos that a mask names and the file lacks are a note; the side folder keeps the mask as it is
         let masks = plan.masks.iter().map(|(name, demos)| {
-            let mut episodes: Vec<usize> = demos.iter().filter_map(|demo| plan.position(demo)).collect();
+            let mut episodes: Vec<usize> =
+                demos.iter().filter_map(|demo| positions.get(demo.as_str()).copied()).collect();
             episodes.sort_unstable();
             (name.clone(), episodes)
         });
         let masks: BTreeMap<String, Vec<usize>> = masks.collect();
-        let absent = plan.masks.iter().map(|(name, demos)| {
-            (name.clone(), demos.iter().filter(|demo| plan.position(demo).is_none()).cloned().collect::<Vec<_>>())
-        });
+        let lacks = |demo: &&String| !positions.contains_key(demo.as_str()) && !self.is_skipped(demo);
+        let absent = plan
+            .masks
+            .iter()
+            .map(|(name, demos)| (name.clone(), demos.iter().filter(&lacks).cloned().collect::<Vec<_>>()));
         let masks_absent = absent.filter(|(_, demos)| !demos.is_empty()).collect();
         let robots = plan.env_args.as_ref().and_then(|args| args.get("env_kwargs")?.get("robots").cloned());
         let robot_type = match robots {
@@ -351,27 +372,5 @@ impl Opened {
             notes: plan.notes.iter().chain(&self.mapping.notes).cloned().collect(),
             last_notes: left_out_notes.into_iter().chain(problems).collect(),
         }
-    }
-
-    /// Datasets that cannot be read and that no column needs, and what to say about them.
-    fn left_out(&self, lossless: bool) -> (Vec<String>, Vec<String>) {
-        let plan = self.input.plan();
-        let mut found: BTreeMap<&str, (usize, String)> = BTreeMap::new();
-        for demo in &plan.demos {
-            let mine = |p: &&Problem| p.fatal && p.demo.as_ref().is_none_or(|id| *id == demo.id);
-            let keys = plan.problems.iter().filter(mine).filter_map(|p| p.key.as_deref());
-            let keys: BTreeSet<&str> = keys.collect();
-            for key in keys {
-                if let Some(error) = plan.unreadable(demo, key) {
-                    found.entry(key).or_insert_with(|| (0, error.to_string())).0 += 1;
-                }
-            }
-        }
-        let demos = plan.demos.len();
-        let note = |(key, (count, error)): (&&str, &(usize, String))| {
-            let side = if lossless { ", from the side folder too" } else { "" };
-            format!("{key} is left out in {count} of {demos} demos{side}: {error}")
-        };
-        (found.keys().map(|key| (*key).to_owned()).collect(), found.iter().map(note).collect())
     }
 }

@@ -70,13 +70,14 @@ pub(crate) fn write_tasks(root: &Path, tasks: &[String]) -> Result<WrittenFile> 
 
 /// The file of episodes: one row each, with its statistics in flat columns named `stats/<feature>/<statistic>`.
 ///
-/// `features` are the names that have statistics, with the length of their vectors and whether they are images.
+/// `features` are the names that have statistics, and whether they are images. `others` are columns of other programs.
 pub(crate) fn write_episodes(
     root: &Path,
     tasks: &[String],
     features: &[(String, bool)],
     rows: &[EpisodeRow],
     stats: &EpisodeStats,
+    others: &[(Field, ArrayRef)],
 ) -> Result<WrittenFile> {
     // a camera has its places whether or not somebody counted its pictures
     let filmed = rows.first().into_iter().flat_map(|row| row.videos.keys());
@@ -84,11 +85,15 @@ pub(crate) fn write_episodes(
     let counted: Vec<&(String, bool)> = features.iter().filter(|(name, _)| stats.all_have(name)).collect();
     let mut groups = rows.chunks(EpisodeStats::GROUP).enumerate().map(|(group, part)| {
         let start = group * EpisodeStats::GROUP;
-        Ok(episode_columns(start, tasks, &filmed, &counted, part, &stats.group(group)?))
+        let mut columns = episode_columns(start, tasks, &filmed, &counted, part, &stats.group(group)?);
+        columns.extend(others.iter().map(|(field, all)| (field.name().clone(), all.slice(start, part.len()))));
+        Ok(columns)
     });
     let first = groups.next().expect("a data set has an episode")?;
     // an episode without frames has no statistics
-    let maybe_null = |name: &str| stats.some_lack() && name.starts_with("stats/");
+    let maybe_null = |name: &str| {
+        stats.some_lack() && name.starts_with("stats/") || others.iter().any(|(other, _)| other.name() == name)
+    };
     let field = |(name, array): &(String, ArrayRef)| Field::new(name, array.data_type().clone(), maybe_null(name));
     let schema = Schema::new(first.iter().map(field).collect::<Vec<_>>());
     let arrays = |columns: Vec<(String, ArrayRef)>| columns.into_iter().map(|(_, array)| array).collect();

@@ -18,6 +18,7 @@ mod info;
 mod meta;
 mod notes;
 mod open;
+mod other_files;
 mod pictures;
 mod read;
 mod schema;
@@ -35,6 +36,7 @@ mod v2;
 mod values;
 mod verify;
 mod videos;
+mod wide;
 mod work;
 
 pub use check::TIME_TOLERANCE;
@@ -53,7 +55,9 @@ pub use open::{ACTION, Column, Dataset, ENVIRONMENT_STATE, EnvMeta, EpisodeMeta,
 pub use pictures::{CameraFile, PictureFile, PictureStore, Pictures};
 pub(crate) use sharded::refuse as refuse_shard;
 pub use sharded::{Shard, ShardReport, convert_shard, merge_shards, shard_files};
+pub use staging::remove_unfinished;
 pub use to_robomimic::rewrite;
 pub use v2::OldSet;
 pub(crate) use v2::version as old_version;
 pub use verify::{Check, source_hash, verify, verify_source, verify_within};
+pub use wide::Wide;

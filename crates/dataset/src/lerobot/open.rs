@@ -227,6 +227,11 @@ impl Dataset {
         self.task_numbers.iter().position(|&n| n == number).map(|at| self.tasks[at].as_str())
     }
 
+    /// The row of an episode in the table of episodes, which may not be there.
+    pub(super) fn table_row(&self, episode: usize) -> usize {
+        self.table_rows.as_ref().map_or(episode, |rows| rows[episode])
+    }
+
     /// What the table of episodes says in each row, in the order of the episodes.
     pub(super) fn in_order<T: Clone>(&self, rows: Vec<T>) -> Result<Vec<T>> {
         let Some(order) = &self.table_rows else { return Ok(rows) };

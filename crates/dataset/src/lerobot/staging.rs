@@ -4,6 +4,7 @@
 //! renames it, or exchanges it with the folder that it replaces. A writer that is killed leaves a hidden folder, locked by
 //! nobody, and the next writer of the same target removes it.
 
+use super::other_files;
 use super::work::in_order;
 use crate::error::{DatasetError, Result};
 use rustix::fs::{CWD, RenameFlags, renameat_with};
@@ -44,13 +45,13 @@ impl Staging {
 
     fn beside(target: &Path, replaces: bool) -> Result<Self> {
         let parent = parent_of(target);
-        let name = target.file_name().ok_or_else(|| DatasetError::Io {
+        let prefix = prefix_of(target).ok_or_else(|| DatasetError::Io {
             path: target.to_path_buf(),
             operation: "create a folder of this name",
             source: io::Error::from(io::ErrorKind::InvalidInput),
         })?;
-        let prefix = format!(".{}.partial-", name.to_string_lossy());
         sweep(parent, &prefix);
+        let prefix = own(&prefix);
         loop {
             let folder = tempfile::Builder::new()
                 .prefix(&prefix)
@@ -79,10 +80,11 @@ impl Staging {
         &self.path
     }
 
-    /// Flushes everything to disk and gives the folder its name.
+    /// Flushes everything to disk and gives the folder its name. What is no part of the set that it replaces stays there.
     pub(crate) fn publish(mut self) -> Result<()> {
         sync_tree(&self.path)?;
         if self.replaces {
+            other_files::carry_over(&self.target, &self.path)?;
             // at once: at no time is there neither of the two
             renameat_with(CWD, &self.path, CWD, &self.target, RenameFlags::EXCHANGE)
                 .map_err(|errno| io_error(&self.target, "exchange it with what was written beside it")(errno.into()))?;
@@ -114,6 +116,39 @@ impl Drop for Staging {
         if !self.published {
             // nothing more can be done about a failure here; the next writer sweeps
             let _ = std::fs::remove_dir_all(&self.path);
+        }
+    }
+}
+
+/// How the names of the hidden folders of a target begin.
+fn prefix_of(target: &Path) -> Option<String> {
+    Some(format!(".{}.partial-", target.file_name()?.to_string_lossy()))
+}
+
+/// How those of this process begin.
+pub(super) fn own(prefix: &str) -> String {
+    format!("{prefix}{}-", rustix::process::getpid().as_raw_nonzero())
+}
+
+/// Removes what this process has begun to write for the file or folder `out`: before it ends without unwinding.
+pub fn remove_unfinished(out: &Path) {
+    crate::source::remove_unfinished(out);
+    // what a link names is replaced
+    let target = std::fs::canonicalize(out).unwrap_or_else(|_| out.to_path_buf());
+    let folders = [
+        (parent_of(&target).to_path_buf(), prefix_of(&target)),
+        (std::env::temp_dir(), Some(super::v2::VIEW.to_owned())),
+    ];
+    for (parent, prefix) in folders {
+        let (Some(prefix), Ok(entries)) = (prefix, std::fs::read_dir(parent)) else { continue };
+        let prefix = own(&prefix);
+        for entry in entries.flatten().filter(|e| e.file_name().to_string_lossy().starts_with(&prefix)) {
+            // other threads may still be writing there
+            for _ in 0..10 {
+                if std::fs::remove_dir_all(entry.path()).is_ok() {
+                    break;
+                }
+            }
         }
     }
 }
@@ -188,9 +223,12 @@ fn sync_tree(path: &Path) -> Result<()> {
 fn list_tree(path: &Path, files: &mut Vec<PathBuf>, folders: &mut Vec<PathBuf>) -> Result<()> {
     for entry in std::fs::read_dir(path).map_err(io_error(path, "list it"))? {
         let entry = entry.map_err(io_error(path, "list it"))?.path();
-        match entry.is_dir() {
-            true => list_tree(&entry, files, folders)?,
-            false => files.push(entry),
+        let kind = std::fs::symlink_metadata(&entry).map_err(io_error(&entry, "look at it"))?;
+        match (kind.is_dir(), kind.is_file()) {
+            (true, _) => list_tree(&entry, files, folders)?,
+            (_, true) => files.push(entry),
+            // a link, which its folder holds
+            _ => {}
         }
     }
     folders.push(path.to_owned());
@@ -238,14 +276,26 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let (target, link) = (dir.path().join("set"), dir.path().join("link"));
         std::fs::create_dir(&target).unwrap();
-        std::fs::write(target.join("x"), "old").unwrap();
+        std::fs::create_dir(target.join("data")).unwrap();
+        std::fs::write(target.join("data/x.parquet"), "old").unwrap();
+        for kept in ["README.md", "meta/more.json", ".git/refs/head", "data/notes.txt"] {
+            std::fs::create_dir_all(target.join(kept).parent().unwrap()).unwrap();
+            std::fs::write(target.join(kept), kept).unwrap();
+        }
+        std::os::unix::fs::symlink("README.md", target.join("LIESMICH")).unwrap();
         std::os::unix::fs::symlink(&target, &link).unwrap();
         drop(Staging::replacing(&target).unwrap());
         let staging = Staging::replacing(&link).unwrap();
-        std::fs::write(staging.path().join("x"), "new").unwrap();
-        assert_eq!(std::fs::read_to_string(target.join("x")).unwrap(), "old");
+        std::fs::create_dir(staging.path().join("data")).unwrap();
+        std::fs::write(staging.path().join("data/y.parquet"), "new").unwrap();
+        assert_eq!(std::fs::read_to_string(target.join("data/x.parquet")).unwrap(), "old");
         staging.publish().unwrap();
-        assert_eq!(std::fs::read_to_string(target.join("x")).unwrap(), "new");
+        assert_eq!(names(&target.join("data")), ["notes.txt", "y.parquet"]);
+        // what is no part of a data set stays as it was
+        for kept in ["README.md", "meta/more.json", ".git/refs/head", "data/notes.txt"] {
+            assert_eq!(std::fs::read_to_string(target.join(kept)).unwrap(), kept);
+        }
+        assert_eq!(std::fs::read_link(target.join("LIESMICH")).unwrap(), Path::new("README.md"));
         assert_eq!(names(dir.path()), ["link", "set"]);
         assert!(Staging::replacing(&dir.path().join("none")).is_err());
     }

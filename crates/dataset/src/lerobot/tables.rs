@@ -58,7 +58,7 @@ pub(super) struct Tables {
     rows: Vec<Row>,
     files: Vec<DataFile>,
     /// Columns of the files that are no features, each with the first file that has it.
-    strangers: BTreeMap<String, String>,
+    unstated: BTreeMap<String, String>,
     frames: usize,
     /// The columns that number frames, as far as the files have them.
     numbers: BTreeMap<String, Vec<i64>>,
@@ -92,7 +92,7 @@ impl Tables {
             texts: Vec::new(),
             number_of: BTreeMap::new(),
             files: Vec::new(),
-            strangers: BTreeMap::new(),
+            unstated: BTreeMap::new(),
             frames: 0,
             numbers: BTreeMap::new(),
             times: None,
@@ -112,7 +112,7 @@ impl Tables {
             let (rows, arrays) = read::columns_there(&path, &wanted)?;
             for field in read::open(&path)?.schema().fields() {
                 if self.info.features.get(field.name()).is_none() {
-                    self.strangers.entry(field.name().clone()).or_insert_with(|| relative(&self.root, &path));
+                    self.unstated.entry(field.name().clone()).or_insert_with(|| relative(&self.root, &path));
                 }
             }
             for name in NUMBERS {

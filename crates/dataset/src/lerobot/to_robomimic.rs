@@ -170,6 +170,10 @@ pub(super) fn from_columns(
     if !empty.is_empty() {
         notes.push(format!("episodes without frames become demos without steps: {}", list(empty.into_iter())));
     }
+    let several = set.episodes().iter().filter(|episode| episode.tasks.len() > 1).count();
+    if several > 0 {
+        notes.push(format!("{several} episodes have several tasks: a demo has one, and the first of them is kept"));
+    }
     let mut writer = RobomimicWriter::create(out, options)?;
     let total = set.frames() as u64;
     let text =
@@ -191,7 +195,8 @@ pub(super) fn from_columns(
     for name in set.split_names() {
         let episodes = set.split(name).unwrap_or_default();
         let demos: Vec<String> = episodes.iter().filter_map(|&episode| ids.get(episode).cloned()).collect();
-        if !demos.is_empty() && demos.len() < ids.len() {
+        // a range that LeRobot writes of every set is no mask
+        if provenance.is_some() || (!demos.is_empty() && demos.len() < ids.len()) {
             writer.set_mask(name, &demos)?;
         }
     }
@@ -442,7 +447,9 @@ pub fn rewrite(
         progress(done, total);
     }
     writer.finish()?;
-    Ok(ExportReport { demos: plan.demos.len(), frames: plan.frames(), notes: plan.notes.clone() })
+    let problems = plan.problems.iter().filter(|problem| !problem.fatal).map(|problem| problem.message.clone());
+    let notes = plan.notes.iter().cloned().chain(plan.left_out("").1).chain(problems).collect();
+    Ok(ExportReport { demos: plan.demos.len(), frames: plan.frames(), notes })
 }
 
 /// The pixels of JPEG files, one a step.

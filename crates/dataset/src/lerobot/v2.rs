@@ -9,12 +9,16 @@ use super::meta::{self, EpisodeRow, parse_stats, python_json};
 use super::open::{Dataset, read_file};
 use super::read;
 use super::shards::Place;
+use super::staging::own;
 use super::totals::EpisodeStats;
 use super::verify::not_finite;
 use super::videos::{Stretch, VIDEO_PATH};
 use crate::error::{DatasetError, InputError, Result};
 use crate::source::{NonFinite, list};
 use crate::stats::FeatureStats;
+use arrow_array::{Array, ArrayRef, BooleanArray, Float64Array, Int64Array, ListArray, StringArray};
+use arrow_buffer::OffsetBuffer;
+use arrow_schema::Field;
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
@@ -22,6 +26,10 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::ops::ControlFlow;
 use std::os::unix::fs::symlink;
 use std::path::{Component, Path, PathBuf};
+use std::sync::Arc;
+
+/// How the names of the folders of views begin.
+pub(super) const VIEW: &str = "actrm-view-";
 
 /// Name of the view of an episode's file, in a folder of so many.
 fn numbered(number: usize, extension: &str) -> String {
@@ -57,6 +65,9 @@ struct EpisodeLine {
     #[serde(default)]
     tasks: Vec<String>,
     length: usize,
+    /// What another program added.
+    #[serde(flatten)]
+    added: BTreeMap<String, Value>,
 }
 
 #[derive(Deserialize)]
@@ -115,7 +126,7 @@ impl OldSet {
         let Some(version) = version(root) else { return Ok(None) };
         let failed = |source| DatasetError::Io { path: root.to_path_buf(), operation: "look at it", source };
         let root = std::fs::canonicalize(root).map_err(failed)?;
-        let view = tempfile::tempdir().map_err(|source| DatasetError::Io {
+        let view = tempfile::Builder::new().prefix(&own(VIEW)).tempdir().map_err(|source| DatasetError::Io {
             path: std::env::temp_dir(),
             operation: "create a folder in it",
             source,
@@ -224,6 +235,7 @@ fn show(root: &Path, view: &Path, notes: &mut Vec<String>) -> Result<()> {
     if episodes.is_empty() {
         return Err(InputError::NoDemos { path: root.join("meta/episodes.jsonl"), found: "no line".to_owned() }.into());
     }
+    let added = added_columns(&episodes);
     let visual: Vec<(String, bool)> =
         info.features.0.iter().filter(|(_, f)| f.is_visual()).map(|(name, _)| (name.clone(), true)).collect();
     let mut stats = statistics(root, &visual)?;
@@ -298,7 +310,7 @@ fn show(root: &Path, view: &Path, notes: &mut Vec<String>) -> Result<()> {
         link(&images, &view.join("images"))?;
     }
     meta::write_tasks(view, &texts)?;
-    meta::write_episodes(view, &texts, &visual, &rows, &each)?;
+    meta::write_episodes(view, &texts, &visual, &rows, &each, &added)?;
     let totals = totals(root, &visual, from)?;
     let of_totals: Vec<(String, bool)> = totals.keys().map(|name| (name.clone(), true)).collect();
     meta::write_stats(view, &of_totals, &totals)?;
@@ -312,6 +324,40 @@ fn show(root: &Path, view: &Path, notes: &mut Vec<String>) -> Result<()> {
     }
     info.actrm = None;
     meta::write_info(view, &info).map(drop)
+}
+
+/// What other programs say of each episode, as columns.
+fn added_columns(episodes: &[EpisodeLine]) -> Vec<(Field, ArrayRef)> {
+    let names: BTreeSet<&String> = episodes.iter().flat_map(|line| line.added.keys()).collect();
+    let column = |name: &String| {
+        let array = column_of(&episodes.iter().map(|line| line.added.get(name)).collect::<Vec<_>>());
+        (Field::new(name, array.data_type().clone(), true), array)
+    };
+    names.into_iter().filter(|name| !edit::is_own(name)).map(column).collect()
+}
+
+/// JSON values as a column of the type that all have, or of JSON texts.
+fn column_of(values: &[Option<&Value>]) -> ArrayRef {
+    let each = || values.iter().map(|value| value.filter(|value| !value.is_null()));
+    let all = |is: fn(&Value) -> bool| each().flatten().all(is);
+    if all(Value::is_boolean) {
+        return Arc::new(each().map(|value| value?.as_bool()).collect::<BooleanArray>());
+    } else if all(Value::is_i64) {
+        return Arc::new(each().map(|value| value?.as_i64()).collect::<Int64Array>());
+    } else if all(Value::is_number) {
+        return Arc::new(each().map(|value| value?.as_f64()).collect::<Float64Array>());
+    } else if all(Value::is_string) {
+        return Arc::new(each().map(|value| value?.as_str()).collect::<StringArray>());
+    } else if all(Value::is_array) {
+        let list = each().map(|value| value.and_then(Value::as_array).map_or(&[][..], Vec::as_slice));
+        let lists: Vec<&[Value]> = list.collect();
+        let inner = column_of(&lists.iter().copied().flatten().map(Some).collect::<Vec<_>>());
+        let offsets = OffsetBuffer::from_lengths(lists.iter().map(|list| list.len()));
+        let nulls = each().map(|value| value.is_some()).collect();
+        let element = Arc::new(Field::new("element", inner.data_type().clone(), true));
+        return Arc::new(ListArray::new(element, offsets, inner, Some(nulls)));
+    }
+    Arc::new(each().map(|value| value.map(Value::to_string)).collect::<StringArray>())
 }
 
 /// The first time that is NaN or infinite, in a view, which has a file an episode.

@@ -205,9 +205,20 @@ fn stored(path: &Path, demo: &Demo, key: &str, column: &Column, length: usize) -
     let wrong = || wrong_shape(path, demo, key, &format!("{length} steps of {} numbers", column.dim()));
     let doubles = || array.to_f64().filter(|v| v.len() == column.dim() * length).ok_or_else(wrong);
     Ok(match (column.feature.dtype.as_str(), &array.dtype) {
-        ("int64", Dtype::I64 | Dtype::U64) if array.len() == column.dim() * length => {
+        ("int64", kind @ (Dtype::I64 | Dtype::U64)) if array.len() == column.dim() * length => {
             let (values, _) = array.bytes.as_chunks();
-            Values::I64(values.iter().map(|v| i64::from_le_bytes(*v)).collect())
+            let values: Vec<i64> = values.iter().map(|v| i64::from_le_bytes(*v)).collect();
+            match values.iter().find(|&&value| *kind == Dtype::U64 && value < 0) {
+                None => Values::I64(values),
+                Some(&value) => {
+                    return Err(DatasetError::BadDataset {
+                        path: path.to_path_buf(),
+                        object: format!("{} {key}", demo.id),
+                        expected: "whole numbers below 2^63, which an int64 column holds".to_owned(),
+                        found: (value as u64).to_string(),
+                    });
+                }
+            }
         }
         ("int64", _) => Values::I64(doubles()?.iter().map(|&v| v as i64).collect()),
         ("bool", _) => Values::Bool(doubles()?.iter().map(|&v| v != 0.0).collect()),

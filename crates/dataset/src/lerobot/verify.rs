@@ -150,7 +150,11 @@ pub fn verify_within(root: &Path, tolerance: f64, progress: &mut dyn FnMut(u64, 
         }
         note("splits name episodes", split_problem(&set));
         if set.has_pictures() {
-            note("images decode and have the content recorded", picture_problem(&set, progress)?);
+            let tell = &mut |done, total| {
+                progress(done, total);
+                Ok(())
+            };
+            note("images decode and have the content recorded", picture_problem(&set, true, tell)?);
         } else if set.provenance().is_some() {
             // opening compared it
             note("content has the fingerprint recorded", None);
@@ -200,8 +204,12 @@ fn split_problem(dataset: &Dataset) -> Option<String> {
     None
 }
 
-/// Decodes every picture and compares the whole content with the fingerprint.
-pub(super) fn picture_problem(dataset: &Dataset, progress: &mut dyn FnMut(u64, u64)) -> Result<Option<String>> {
+/// Decodes every picture and compares the whole content with the fingerprint; where it is to be `finite`, depth too.
+pub(super) fn picture_problem(
+    dataset: &Dataset,
+    finite: bool,
+    tell: &mut dyn FnMut(u64, u64) -> Result<()>,
+) -> Result<Option<String>> {
     let info: &Info = dataset.info();
     let root = dataset.root();
     let mut cursors = BTreeMap::new();
@@ -248,7 +256,7 @@ pub(super) fn picture_problem(dataset: &Dataset, progress: &mut dyn FnMut(u64, u
         for (name, (rows, width)) in &mut depths {
             let (mut summary, mut bad) = (PictureSummary::default(), None);
             let looked = dataset.each_depth(rows, name, episode.index, &mut |frame, kind, pixels| {
-                let found = depth::not_finite(kind, *width, pixels);
+                let found = depth::not_finite(kind, *width, pixels).filter(|_| finite);
                 bad = bad.take().or(found.map(|found| format!("frame {frame} of episode {}: {found}", episode.index)));
                 summary.digests.push(Sha256::digest(pixels).into());
                 Ok(())
@@ -268,7 +276,7 @@ pub(super) fn picture_problem(dataset: &Dataset, progress: &mut dyn FnMut(u64, u
             }
             fingerprint.column(name, PictureSummary { digests, ..PictureSummary::default() }.digest());
         }
-        progress(episode.to as u64, dataset.frames() as u64);
+        tell(episode.to as u64, dataset.frames() as u64)?;
     }
     let computed = fingerprint.finish();
     Ok(match dataset.provenance() {

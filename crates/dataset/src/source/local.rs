@@ -134,13 +134,15 @@ fn files_of(folder: &Path) -> Result<Vec<PathBuf>, InputError> {
     if found.is_empty() {
         return Err(no_demonstrations(folder, &others));
     }
-    let number = |path: &Path| {
-        let stem = path.file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();
-        let digits = stem.bytes().rev().take_while(u8::is_ascii_digit).count();
-        stem[stem.len() - digits..].parse::<u64>().unwrap_or(u64::MAX)
-    };
-    found.sort_by_cached_key(|path| (number(path), path.clone()));
+    found.sort_by_cached_key(|path| (file_number(path), path.clone()));
     Ok(found)
+}
+
+/// The number at the end of a file's name, which orders the files of a folder.
+pub(crate) fn file_number(path: &Path) -> u64 {
+    let stem = path.file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();
+    let digits = stem.bytes().rev().take_while(u8::is_ascii_digit).count();
+    stem[stem.len() - digits..].parse().unwrap_or(u64::MAX)
 }
 
 /// Files by which a folder is known as a data set: of LeRobot, zarr, RLDS.

@@ -27,10 +27,11 @@ use crate::tree::{Array, Demo};
 use local::{Backend, Local};
 
 pub(crate) use dialect::list;
-pub(crate) use local::files;
+pub(crate) use local::{file_number, files};
 pub use video::{VideoFile, VideoInfo};
 pub(crate) use walk::is_lfs_pointer;
-pub use writer::{RobomimicWriter, WriteOptions, remove_unfinished};
+pub(crate) use writer::remove_unfinished;
+pub use writer::{RobomimicWriter, WriteOptions};
 
 /// The most that [`Source::read_demo`] reads at once.
 const MAX_DEMO: u64 = 512 << 20;

@@ -2,6 +2,9 @@
 //! `dataset_info.json`. A record is a `tf.train.Example` in which every list of `steps/...` has the values of all steps in a row.
 //! Read without TensorFlow, after the descriptions of both formats.
 
+mod example;
+mod features;
+
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::os::unix::fs::FileExt;
@@ -11,6 +14,8 @@ use std::sync::{Arc, Mutex, PoisonError};
 use serde::Deserialize;
 use serde_json::Value;
 
+use self::example::{CUT, byte_strings, count, elements, lists, masked_crc};
+use self::features::{Form, form, key_of, leaves};
 use super::local::Backend;
 use super::value::one_line;
 use crate::error::InputError;
@@ -47,13 +52,6 @@ struct Leaf {
     shape: Vec<usize>,
 }
 
-#[derive(Debug, Clone, PartialEq)]
-enum Form {
-    Numbers(Dtype),
-    Text,
-    Images,
-}
-
 struct Record {
     file: PathBuf,
     /// Where its content begins.
@@ -86,289 +84,11 @@ struct Split {
     filepath_template: Option<String>,
 }
 
-// ---- TFRecord and protocol buffers ----
-
-/// CRC-32C, rotated and shifted, as TFRecord stores it.
-fn masked_crc(bytes: &[u8]) -> u32 {
-    const TABLE: [u32; 256] = {
-        let mut table = [0; 256];
-        let mut i = 0;
-        while i < 256 {
-            let (mut crc, mut bit) = (i as u32, 0);
-            while bit < 8 {
-                crc = if crc & 1 == 1 { crc >> 1 ^ 0x82f6_3b78 } else { crc >> 1 };
-                bit += 1;
-            }
-            table[i] = crc;
-            i += 1;
-        }
-        table
-    };
-    let crc = !bytes.iter().fold(!0_u32, |crc, &byte| TABLE[usize::from(crc as u8 ^ byte)] ^ crc >> 8);
-    crc.rotate_right(15).wrapping_add(0xa282_ead8)
-}
-
-/// A field of a message.
-enum Field<'a> {
-    Number(u64),
-    Bytes(&'a [u8]),
-    Fixed(u32),
-}
-
 /// What is left out without a demo being lost: the reason, and the record where it was seen first, by name.
 type LeftOut = BTreeMap<String, String>;
 
 /// Why a text is left out.
 const NO_TEXT: &str = "bytes that are no UTF-8 text";
-const CUT: &str = "a message that is cut off";
-
-fn varint(rest: &mut &[u8]) -> Result<u64, String> {
-    let mut number = 0;
-    for shift in (0..64).step_by(7) {
-        let (&byte, tail) = rest.split_first().ok_or(CUT)?;
-        *rest = tail;
-        number |= u64::from(byte & 127) << shift;
-        if byte < 128 {
-            return Ok(number);
-        }
-    }
-    Err("a number of more than 64 bits".to_owned())
-}
-
-/// Calls `take` with the number and content of every field of a message.
-fn fields<'a>(message: &'a [u8], take: &mut dyn FnMut(u64, Field<'a>) -> Result<(), String>) -> Result<(), String> {
-    let mut rest = message;
-    while !rest.is_empty() {
-        let tag = varint(&mut rest)?;
-        let field = match tag & 7 {
-            0 => Field::Number(varint(&mut rest)?),
-            1 => {
-                rest = rest.get(8..).ok_or(CUT)?;
-                continue;
-            }
-            2 => {
-                let length = usize::try_from(varint(&mut rest)?).map_err(|e| e.to_string())?;
-                let (content, tail) = rest.split_at_checked(length).ok_or(CUT)?;
-                rest = tail;
-                Field::Bytes(content)
-            }
-            5 => {
-                let (four, tail) = rest.split_first_chunk::<4>().ok_or(CUT)?;
-                rest = tail;
-                Field::Fixed(u32::from_le_bytes(*four))
-            }
-            kind => return Err(format!("a field of kind {kind}")),
-        };
-        take(tag >> 3, field)?;
-    }
-    Ok(())
-}
-
-/// The lists of an example by name: kind (1 bytes, 2 floats, 3 whole numbers, 0 of a list without one) and content.
-type Lists<'a> = BTreeMap<&'a str, (u64, &'a [u8])>;
-
-fn lists(record: &[u8]) -> Result<Lists<'_>, String> {
-    let mut found = Lists::new();
-    fields(record, &mut |number, field| match (number, field) {
-        (1, Field::Bytes(features)) => fields(features, &mut |number, entry| {
-            let (1, Field::Bytes(entry)) = (number, entry) else { return Ok(()) };
-            let (mut name, mut list) = ("", (0, &[][..]));
-            fields(entry, &mut |number, field| {
-                match (number, field) {
-                    (1, Field::Bytes(text)) => name = std::str::from_utf8(text).map_err(|e| e.to_string())?,
-                    (2, Field::Bytes(feature)) => fields(feature, &mut |kind, field| {
-                        if let Field::Bytes(content) = field {
-                            list = (kind, content);
-                        }
-                        Ok(())
-                    })?,
-                    _ => {}
-                }
-                Ok(())
-            })?;
-            found.insert(name, list);
-            Ok(())
-        }),
-        _ => Ok(()),
-    })?;
-    Ok(found)
-}
-
-fn byte_strings(list: &[u8]) -> Result<Vec<&[u8]>, String> {
-    let mut all = Vec::new();
-    fields(list, &mut |_, field| {
-        if let Field::Bytes(one) = field {
-            all.push(one);
-        }
-        Ok(())
-    })?;
-    Ok(all)
-}
-
-/// Calls `take` with every number of a list, as float or as whole number.
-fn numbers(kind: u64, list: &[u8], take: &mut dyn FnMut(f32, i64)) -> Result<(), String> {
-    fields(list, &mut |_, field| {
-        match (kind, field) {
-            (2, Field::Bytes(packed)) => {
-                let (values, rest) = packed.as_chunks::<4>();
-                values.iter().for_each(|&v| take(f32::from_le_bytes(v), 0));
-                if !rest.is_empty() {
-                    return Err(CUT.to_owned());
-                }
-            }
-            (2, Field::Fixed(bits)) => take(f32::from_bits(bits), 0),
-            (3, Field::Bytes(mut packed)) => {
-                while !packed.is_empty() {
-                    take(0.0, varint(&mut packed)? as i64);
-                }
-            }
-            (3, Field::Number(number)) => take(0.0, number as i64),
-            _ => return Err("a list of numbers that holds something else".to_owned()),
-        }
-        Ok(())
-    })
-}
-
-/// Number of elements of a list.
-fn count(kind: u64, list: &[u8]) -> Result<usize, String> {
-    let mut all = 0;
-    match kind {
-        1 => all = byte_strings(list)?.len(),
-        _ => numbers(kind, list, &mut |_, _| all += 1)?,
-    }
-    Ok(all)
-}
-
-/// The numbers of a list in their own type.
-fn elements(kind: u64, list: &[u8], dtype: &Dtype) -> Result<Vec<u8>, String> {
-    let (mut out, mut beyond) = (Vec::new(), None);
-    let whole = kind == 3;
-    let put = &mut |float: f32, number: i64| {
-        let bytes = number.to_le_bytes();
-        match dtype {
-            Dtype::F32 if whole => out.extend_from_slice(&(number as f32).to_le_bytes()),
-            Dtype::F32 => out.extend_from_slice(&float.to_le_bytes()),
-            Dtype::F64 if whole => out.extend_from_slice(&(number as f64).to_le_bytes()),
-            Dtype::F64 => out.extend_from_slice(&f64::from(float).to_le_bytes()),
-            Dtype::Bool => out.push(u8::from(number != 0)),
-            other => {
-                if !holds(other, number) {
-                    beyond.get_or_insert(number);
-                }
-                out.extend_from_slice(&bytes[..other.size().unwrap_or(8)]);
-            }
-        }
-    };
-    if !whole && !matches!(dtype, Dtype::F32 | Dtype::F64) {
-        return Err(format!("floats where {dtype} is stated"));
-    }
-    numbers(kind, list, put)?;
-    match beyond {
-        Some(number) => Err(format!("the number {number} where {dtype} is stated")),
-        None => Ok(out),
-    }
-}
-
-/// Whether a type has this number; the records have those of uint64 as int64 of the same bits.
-fn holds(dtype: &Dtype, number: i64) -> bool {
-    match dtype {
-        Dtype::U8 => u8::try_from(number).is_ok(),
-        Dtype::I8 => i8::try_from(number).is_ok(),
-        Dtype::U16 => u16::try_from(number).is_ok(),
-        Dtype::I16 => i16::try_from(number).is_ok(),
-        Dtype::U32 => u32::try_from(number).is_ok(),
-        Dtype::I32 => i32::try_from(number).is_ok(),
-        _ => true,
-    }
-}
-
-// ---- what features.json states ----
-
-/// Finds the leaves below a feature: name, and what is stated of it.
-fn leaves<'v>(feature: &'v Value, name: &str, depth: usize, found: &mut Vec<(String, &'v Value)>) {
-    let dict = feature.pointer("/featuresDict/features").and_then(Value::as_object);
-    match (dict, feature.pointer("/sequence/feature")) {
-        (Some(dict), _) if depth > 0 => {
-            for (child, feature) in dict {
-                let name = if name.is_empty() { child.clone() } else { format!("{name}/{child}") };
-                leaves(feature, &name, depth - 1, found);
-            }
-        }
-        (None, Some(step)) if name == "steps" && depth > 0 => leaves(step, name, depth - 1, found),
-        _ => found.push((name.to_owned(), feature)),
-    }
-}
-
-/// Form and shape of a leaf; what it is in words where it cannot be read.
-fn form(feature: &Value) -> Result<(Form, Vec<usize>), String> {
-    let what = || {
-        let class = feature.get("pythonClassName").and_then(Value::as_str).unwrap_or("a feature without a class");
-        class.rsplit('.').next().unwrap_or(class).to_owned()
-    };
-    if feature.get("text").is_some() {
-        return Ok((Form::Text, Vec::new()));
-    }
-    if feature.get("classLabel").is_some() {
-        return Ok((Form::Numbers(Dtype::I64), Vec::new()));
-    }
-    let (stated, is_image) = match (feature.get("tensor"), feature.get("image")) {
-        (Some(tensor), _) => (tensor, false),
-        (None, Some(image)) => (image, true),
-        _ => return Err(what()),
-    };
-    let of = |key: &str| stated.get(key).and_then(Value::as_str).unwrap_or("");
-    let dimensions = stated.pointer("/shape/dimensions").and_then(Value::as_array);
-    let extent = |d: &Value| d.as_i64().or_else(|| d.as_str()?.parse().ok());
-    let shape: Option<Vec<i64>> = dimensions.into_iter().flatten().map(extent).collect();
-    let shape = shape.ok_or_else(what)?;
-    if is_image {
-        return match (of("dtype"), shape.last()) {
-            ("uint8" | "", Some(3)) => Ok((Form::Images, Vec::new())),
-            (dtype, channels) => Err(format!("{} of {dtype} with {} channels", what(), channels.unwrap_or(&0))),
-        };
-    }
-    let shape: Vec<usize> = shape
-        .into_iter()
-        .map(|n| usize::try_from(n).ok())
-        .collect::<Option<_>>()
-        .ok_or("an extent that is not stated")?;
-    if !matches!(of("encoding"), "" | "none") {
-        return Err(format!("{} with encoding {}", what(), of("encoding")));
-    }
-    if shape.iter().try_fold(1_usize, |n, &extent| n.checked_mul(extent)).is_none_or(|n| n == 0 || n > MAX_ROWS / 8) {
-        return Err(format!("{} of shape {shape:?}", what()));
-    }
-    let dtype = match of("dtype") {
-        "float32" | "float16" | "bfloat16" => Dtype::F32,
-        "float64" => Dtype::F64,
-        "bool" => Dtype::Bool,
-        "uint8" => Dtype::U8,
-        "int8" => Dtype::I8,
-        "uint16" => Dtype::U16,
-        "int16" => Dtype::I16,
-        "uint32" => Dtype::U32,
-        "int32" => Dtype::I32,
-        "uint64" => Dtype::U64,
-        "int64" => Dtype::I64,
-        "string" if shape.is_empty() => return Ok((Form::Text, shape)),
-        other => return Err(format!("{} of {other}", what())),
-    };
-    Ok((Form::Numbers(dtype), shape))
-}
-
-/// robomimic's names for those of RLDS.
-fn key_of(name: &str) -> String {
-    match name.split_once('/') {
-        None if name == "action" => "actions".to_owned(),
-        None if name == "reward" => "rewards".to_owned(),
-        None if name == "is_terminal" => "dones".to_owned(),
-        Some(("action", rest)) => format!("action_dict/{rest}"),
-        Some(("observation", rest)) => format!("obs/{rest}"),
-        _ => name.to_owned(),
-    }
-}
-
-// ---- the data set ----
 
 impl Rlds {
     /// Opens a folder with `features.json` and `dataset_info.json`; `None` where the path is none.

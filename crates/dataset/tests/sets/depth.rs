@@ -2,7 +2,7 @@
 
 #![allow(clippy::unwrap_used)]
 
-use crate::common::copy;
+use crate::common::{copy, going};
 use arrow_array::{Array as _, ArrayRef, BinaryArray, RecordBatch, StructArray};
 use arrow_schema::Field;
 use dataset::edit::{Destination, Renames, Selection, keep, merge, rename, without};
@@ -301,7 +301,7 @@ fn films_leave_depth_exact() {
     export(&out, &back, &WriteOptions::default(), &mut quiet).unwrap();
     assert!(content(&back) == content(&file));
     let part = dir.path().join("part");
-    keep(&out, &Destination::New(part.clone()), &numbers(&[1]), &mut quiet).unwrap();
+    keep(&out, &Destination::New(part.clone()), &numbers(&[1]), &mut going).unwrap();
     sound(&part);
     assert_eq!(
         Dataset::open(&part).unwrap().depth_maps(SIDE_DEPTH, 0).unwrap(),
@@ -424,10 +424,10 @@ fn an_edited_set_is_what_conversion_makes_of_the_same_demos() {
     let demos = three();
     converted("all", &demos);
     converted("some", &[demos[0].clone(), demos[2].clone()]);
-    without(&at("all"), &Destination::New(at("cut")), &numbers(&[1]), &mut quiet).unwrap();
+    without(&at("all"), &Destination::New(at("cut")), &numbers(&[1]), &mut going).unwrap();
     converted("first", &demos[..1]);
     converted("rest", &demos[1..]);
-    merge(&[at("first"), at("rest")], &at("joined"), &mut quiet).unwrap();
+    merge(&[at("first"), at("rest")], &at("joined"), &mut going).unwrap();
     for (made, wanted) in [("cut", "some"), ("joined", "all")] {
         sound(&at(made));
         let (a, b) = (Dataset::open(&at(made)).unwrap(), Dataset::open(&at(wanted)).unwrap());
@@ -438,7 +438,7 @@ fn an_edited_set_is_what_conversion_makes_of_the_same_demos() {
     }
     let new = "observation.images.near_depth";
     let renames = Renames::from([(FRONT_DEPTH.to_owned(), new.to_owned())]);
-    rename(&at("all"), &Destination::New(at("named")), &renames, &mut quiet).unwrap();
+    rename(&at("all"), &Destination::New(at("named")), &renames, &mut going).unwrap();
     sound(&at("named"));
     let (named, all) = (Dataset::open(&at("named")).unwrap(), Dataset::open(&at("all")).unwrap());
     assert_eq!(named.depth_maps(new, 2).unwrap(), all.depth_maps(FRONT_DEPTH, 2).unwrap());
@@ -449,7 +449,7 @@ fn an_edited_set_is_what_conversion_makes_of_the_same_demos() {
     let info = at("mm/meta/info.json");
     let text = std::fs::read_to_string(&info).unwrap();
     std::fs::write(&info, text.replacen("\"depth_unit\": \"m\"", "\"depth_unit\": \"mm\"", 1)).unwrap();
-    let told = merge(&[theirs(), at("mm")], &at("mixed"), &mut quiet).unwrap_err().to_string();
+    let told = merge(&[theirs(), at("mm")], &at("mixed"), &mut going).unwrap_err().to_string();
     let wanted = format!("features.{FRONT_DEPTH}.info: expected depth in m, as in ");
     assert!(told.contains(&wanted) && told.ends_with("found depth in mm"), "{told}");
 }
@@ -476,12 +476,12 @@ fn what_lerobot_recorded_is_read_checked_and_edited() {
     // statistics computed anew are LeRobot's, up to its float32 means; its quantiles come from a histogram and lie
     // anywhere between two values, which are up to 0.3 m apart in so few frames
     let all = dir.path().join("all");
-    keep(&theirs(), &Destination::New(all.clone()), &numbers(&[0, 1, 2]), &mut quiet).unwrap();
+    keep(&theirs(), &Destination::New(all.clone()), &numbers(&[0, 1, 2]), &mut going).unwrap();
     let again = Dataset::open(&all).unwrap();
     near(&again.stats()[FRONT_DEPTH], &set.stats()[FRONT_DEPTH], 1e-5, 0.15);
     near(&again.stats()[WRIST_DEPTH], &set.stats()[WRIST_DEPTH], 5e-3, 75.0);
     let cut = dir.path().join("cut");
-    without(&theirs(), &Destination::New(cut.clone()), &numbers(&[0]), &mut quiet).unwrap();
+    without(&theirs(), &Destination::New(cut.clone()), &numbers(&[0]), &mut going).unwrap();
     sound(&cut);
     let cut = Dataset::open(&cut).unwrap();
     assert_eq!(cut.depth_maps(FRONT_DEPTH, 1).unwrap(), set.depth_maps(FRONT_DEPTH, 2).unwrap());
@@ -521,13 +521,15 @@ fn damaged_frames_are_named_wherever_they_are_read() {
         let checks = verify(&root, &mut quiet).unwrap();
         named(&checks.iter().find_map(|c| c.problem.clone()).unwrap());
         let out = dir.path().join("out");
-        named(&keep(&root, &Destination::New(out.clone()), &numbers(&[1]), &mut quiet).unwrap_err().to_string());
+        named(&keep(&root, &Destination::New(out.clone()), &numbers(&[1]), &mut going).unwrap_err().to_string());
         assert!(!out.exists());
     }
     let root = broken("nan", &|file| [&file[..134], &f32::NAN.to_le_bytes(), &file[138..]].concat());
     let checks = verify(&root, &mut quiet).unwrap();
     let told = checks.iter().find_map(|c| c.problem.clone()).unwrap();
     assert_eq!(told, format!("{FRONT_DEPTH}: frame 2 of episode 1: NaN in row 0, column 0"));
+    // what a set holds already is no reason to refuse an edit of it
+    keep(&root, &Destination::New(dir.path().join("kept")), &numbers(&[1]), &mut going).unwrap();
 }
 
 #[test]
@@ -545,7 +547,7 @@ fn depth_as_video_is_refused_by_name() {
     let out = dir.path().join("out");
     for told in [
         set.depth_maps(FRONT_DEPTH, 0).unwrap_err().to_string(),
-        keep(&root, &Destination::New(out.clone()), &numbers(&[1]), &mut quiet).unwrap_err().to_string(),
+        keep(&root, &Destination::New(out.clone()), &numbers(&[1]), &mut going).unwrap_err().to_string(),
         // one check of several, so that the others are made
         verify(&root, &mut quiet).unwrap().into_iter().find_map(|check| check.problem).unwrap(),
     ] {

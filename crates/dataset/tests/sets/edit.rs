@@ -5,7 +5,7 @@
 #[path = "sharded.rs"]
 mod sharded;
 
-use crate::common::files;
+use crate::common::{files, going};
 use arrow_array::cast::AsArray;
 use arrow_array::types::Float64Type;
 use arrow_array::{ArrayRef, Float64Array, RecordBatch};
@@ -183,14 +183,17 @@ fn what_is_kept_is_as_if_it_alone_had_been_converted() {
         let mut told = (0, 0);
         let kept = folder.join("kept");
         let chosen = Selection { episodes: vec![1], demos: vec!["demo_4".to_owned()], masks: vec!["odd".to_owned()] };
-        let report =
-            keep(&whole, &Destination::New(kept.clone()), &chosen, &mut |done, all| told = (done, all)).unwrap();
+        let mut tell = |done, all| {
+            told = (done, all);
+            going(done, all)
+        };
+        let report = keep(&whole, &Destination::New(kept.clone()), &chosen, &mut tell).unwrap();
         assert_eq!((report.episodes, report.frames, told.0), (3, 26, told.1), "{kind}");
         assert!(told.1 >= 26 && report.notes.is_empty(), "{kind}: {told:?} {:?}", report.notes);
         sound(&kept);
         assert_same_set(&kept, &expected);
         let dropped = folder.join("dropped");
-        without(&whole, &Destination::New(dropped.clone()), &numbers(&[0, 2]), &mut quiet).unwrap();
+        without(&whole, &Destination::New(dropped.clone()), &numbers(&[0, 2]), &mut going).unwrap();
         assert!(files(&dropped) == files(&kept), "{kind}: to drop some is to keep the others");
         assert!(files(&whole) == before, "{kind}: the source is as it was");
         let back = folder.join("back.hdf5");
@@ -214,19 +217,19 @@ fn everything_kept_is_the_same_set_and_parts_put_together_are_the_whole() {
         let demos: Vec<Demo> = [6, 3, 8, 4].iter().enumerate().map(|(i, &n)| synthetic(2 * i, n, side)).collect();
         let whole = converted(&demos, &folder, "whole", &options);
         let all = folder.join("all");
-        keep(&whole, &Destination::New(all.clone()), &numbers(&[0, 1, 2, 3]), &mut quiet).unwrap();
+        keep(&whole, &Destination::New(all.clone()), &numbers(&[0, 1, 2, 3]), &mut going).unwrap();
         assert_same_set(&all, &whole);
         assert_eq!(Dataset::open(&all).unwrap().stats(), Dataset::open(&whole).unwrap().stats(), "{kind}");
         let parts = folder.join("parts");
         let shares = Parts::Fractions(vec![("a".to_owned(), 0.5), ("b".to_owned(), 0.25), ("c".to_owned(), 0.25)]);
-        let made = split(&whole, &parts, &shares, None, &mut quiet).unwrap();
+        let made = split(&whole, &parts, &shares, None, &mut going).unwrap();
         let sizes: Vec<(&str, usize)> =
             made.iter().map(|(name, r): &(String, EditReport)| (name.as_str(), r.episodes)).collect();
         assert_eq!(sizes, [("a", 2), ("b", 1), ("c", 1)], "{kind}");
         let again = folder.join("again");
         let each: Vec<PathBuf> = ["a", "b", "c"].iter().map(|name| parts.join(name)).collect();
         each.iter().for_each(|part| sound(part));
-        let report = merge(&each, &again, &mut quiet).unwrap();
+        let report = merge(&each, &again, &mut going).unwrap();
         assert_eq!(report.notes, [""; 0], "{kind}");
         sound(&again);
         assert_same_set(&again, &whole);
@@ -246,10 +249,10 @@ fn two_files_become_one_with_new_numbers_for_demos_that_both_have() {
     let dir = tempfile::tempdir().unwrap();
     let options = ConvertOptions { fps: Some(20.0), ..ConvertOptions::default() };
     // `states` are of another type in the second
-    let one = converted(&[synthetic(0, 4, None), synthetic(1, 5, None)], dir.path(), "one", &options);
-    let two = converted(&[synthetic(1, 3, None), synthetic(2, 6, None)], dir.path(), "two", &options);
+    let one = converted(&[synthetic(0, 4, None), synthetic(1, 5, None)], dir.path(), "a_10", &options);
+    let two = converted(&[synthetic(1, 3, None), synthetic(2, 6, None)], dir.path(), "b_2", &options);
     let all = dir.path().join("all");
-    let report = merge(&[one.clone(), two.clone()], &all, &mut quiet).unwrap();
+    let report = merge(&[one.clone(), two.clone()], &all, &mut going).unwrap();
     assert_eq!(report.notes, ["1 demos have a new number: another set has a demo of theirs"]);
     sound(&all);
     let set = Dataset::open(&all).unwrap();
@@ -262,8 +265,15 @@ fn two_files_become_one_with_new_numbers_for_demos_that_both_have() {
     assert_eq!(root.inner_attrs["data"]["total"].to_i64(), Some(18));
     assert_eq!(root.datasets["mask/odd"].to_strings().unwrap(), ["demo_1", "demo_3"]);
     let renumbered = |number: usize, of: &Demo| Demo { id: format!("demo_{number}"), ..of.clone() };
-    let (first, second) = (content(&dir.path().join("one.hdf5")).1, content(&dir.path().join("two.hdf5")).1);
+    let (first, second) = (content(&dir.path().join("a_10.hdf5")).1, content(&dir.path().join("b_2.hdf5")).1);
     assert!(demos == [first[0].clone(), first[1].clone(), second[1].clone(), renumbered(3, &second[0])]);
+    // the source is a folder of both files, in the order of their numbers
+    let both = dir.path().join("both");
+    std::fs::create_dir(&both).unwrap();
+    for name in ["a_10.hdf5", "b_2.hdf5"] {
+        std::fs::rename(dir.path().join(name), both.join(name)).unwrap();
+    }
+    assert_eq!(dataset::verify_source(&all, &both).unwrap().problem, None);
 }
 
 #[test]
@@ -288,7 +298,7 @@ fn files_that_differ_beside_their_demos_are_joined_as_far_as_they_agree() {
     let args = r#"{"env_name": "Lift", "env_kwargs": {"control_freq": 20}}"#;
     let (a, b) = (set("a", args, "monday", 1), set("b", args, "tuesday", 2));
     let all = dir.path().join("all");
-    let report = merge(&[a.clone(), b], &all, &mut quiet).unwrap();
+    let report = merge(&[a.clone(), b], &all, &mut going).unwrap();
     assert_eq!(report.notes, ["the sets differ in data/date, which the side folder leaves out"]);
     sound(&all);
     assert_eq!(Dataset::open(&all).unwrap().env().unwrap().seeds.as_deref(), Some("10-29"));
@@ -299,11 +309,11 @@ fn files_that_differ_beside_their_demos_are_joined_as_far_as_they_agree() {
     assert!(data.contains_key("env_args") && !data.contains_key("date"));
     // other arguments: no file has both, the frames can be had all the same
     let c = set("c", r#"{"env_name": "Lift", "env_kwargs": {"control_freq": 20, "robots": "Sawyer"}}"#, "monday", 3);
-    let told = merge(&[a.clone(), c], &dir.path().join("ac"), &mut quiet).unwrap_err().to_string();
+    let told = merge(&[a.clone(), c], &dir.path().join("ac"), &mut going).unwrap_err().to_string();
     assert!(told.contains("robot_type: expected none, as in ") && told.ends_with("found Sawyer"), "{told}");
     let d = set("d", r#"{"env_name": "Lift", "env_kwargs": {"control_freq": 20, "horizon": 9}}"#, "monday", 4);
     let out = dir.path().join("ad");
-    let report = merge(&[a.clone(), d], &out, &mut quiet).unwrap();
+    let report = merge(&[a.clone(), d], &out, &mut going).unwrap();
     assert!(report.notes.iter().any(|n| n.contains("env_args")), "{:?}", report.notes);
     assert!(report.notes.iter().any(|n| n.contains("no HDF5 file can be rebuilt")), "{:?}", report.notes);
     sound(&out);
@@ -311,7 +321,7 @@ fn files_that_differ_beside_their_demos_are_joined_as_far_as_they_agree() {
     let columns = dir.path().join("columns.hdf5");
     assert!(export(&out, &columns, &WriteOptions::default(), &mut quiet).is_ok(), "a file of the columns");
     let e = set("e", r#"{"env_name": "Stack", "env_kwargs": {"control_freq": 20}}"#, "monday", 5);
-    let told = merge(&[a, e], &dir.path().join("ae"), &mut quiet).unwrap_err().to_string();
+    let told = merge(&[a, e], &dir.path().join("ae"), &mut going).unwrap_err().to_string();
     assert!(told.contains("actrm.env_name: expected Some(\"Lift\"), as in"), "{told}");
 }
 
@@ -334,13 +344,17 @@ fn features_get_other_names_wherever_they_stand() {
         .map(|(old, new)| (old.to_owned(), new.to_owned()))
         .into();
         let out = folder.join("renamed");
-        rename(&whole, &Destination::New(out.clone()), &renames, &mut quiet).unwrap();
+        rename(&whole, &Destination::New(out.clone()), &renames, &mut going).unwrap();
         sound(&out);
         let (a, b) = (Dataset::open(&whole).unwrap(), Dataset::open(&out).unwrap());
         assert_eq!(b.cameras().collect::<Vec<_>>(), ["observation.images.front"]);
         assert!(a.pictures(CAMERA).unwrap() == b.pictures("observation.images.front").unwrap());
         assert_eq!(a.column("next.reward"), b.column("observation.environment_state"));
         assert_eq!(a.column("observation.environment_state"), b.column("world"));
+        let away = [("observation.environment_state".to_owned(), "world".to_owned())].into();
+        rename(&whole, &Destination::New(folder.join("away")), &away, &mut going).unwrap();
+        let away = Dataset::open(&folder.join("away")).unwrap();
+        assert!(away.provenance().unwrap().env_keys.is_empty(), "keys of a column that is not there");
         let origin = b.provenance().unwrap();
         assert_eq!((origin.state_keys.len(), origin.env_keys.len()), (3, 0));
         assert_eq!(origin.entities.keys().collect::<Vec<_>>(), ["block"]);
@@ -351,7 +365,7 @@ fn features_get_other_names_wherever_they_stand() {
         }
         // and back again: the same bytes in every file of the format
         let back: Renames = renames.into_iter().map(|(old, new)| (new, old)).collect();
-        rename(&out, &Destination::InPlace, &back, &mut quiet).unwrap();
+        rename(&out, &Destination::InPlace, &back, &mut going).unwrap();
         assert_same_set(&out, &whole);
         assert_eq!(Dataset::open(&out).unwrap().info().features, a.info().features);
     }
@@ -362,11 +376,21 @@ fn in_place_is_the_same_result_and_what_was_there_goes() {
     let dir = tempfile::tempdir().unwrap();
     let (set, new) = (dir.path().join("set"), dir.path().join("new"));
     convert(&fixture(), &set, &ConvertOptions::default(), &mut quiet).unwrap();
-    without(&set, &Destination::New(new.clone()), &numbers(&[1]), &mut quiet).unwrap();
-    without(&set, &Destination::InPlace, &numbers(&[1]), &mut quiet).unwrap();
-    assert!(files(&set) == files(&new));
-    let before = files(&set);
-    assert!(without(&set, &Destination::InPlace, &numbers(&[0, 1]), &mut quiet).is_err());
+    let own = [("README.md", "mine"), (".git/HEAD", "ref"), ("meta/proportions.json", "{}"), ("data/notes.txt", "x")];
+    for (name, text) in own {
+        std::fs::create_dir_all(set.join(name).parent().unwrap()).unwrap();
+        std::fs::write(set.join(name), text).unwrap();
+    }
+    let notes = without(&set, &Destination::New(new.clone()), &numbers(&[1]), &mut going).unwrap().notes;
+    assert_eq!(notes, ["not copied: .git, README.md, data/notes.txt, meta/proportions.json"]);
+    let notes = without(&set, &Destination::InPlace, &numbers(&[1]), &mut going).unwrap().notes;
+    assert_eq!(notes, ["kept as it was, not adapted to the edit: meta/proportions.json"]);
+    let (mut now, before) = (files(&set), files(&set));
+    for (name, text) in own {
+        assert_eq!(now.remove(Path::new(name)).unwrap(), text.as_bytes(), "{name}");
+    }
+    assert!(now == files(&new));
+    assert!(without(&set, &Destination::InPlace, &numbers(&[0, 1]), &mut going).is_err());
     assert!(files(&set) == before);
     assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 2);
 }
@@ -377,7 +401,7 @@ fn what_lerobot_wrote_is_edited_and_its_videos_are_cut_without_encoding() {
     let (cut, parts, again) = (dir.path().join("cut"), dir.path().join("parts"), dir.path().join("again"));
     let theirs = Dataset::open(&lerobot()).unwrap();
     let lengths: Vec<usize> = theirs.episodes().iter().map(|e| e.length).collect();
-    without(&lerobot(), &Destination::New(cut.clone()), &numbers(&[1]), &mut quiet).unwrap();
+    without(&lerobot(), &Destination::New(cut.clone()), &numbers(&[1]), &mut going).unwrap();
     sound(&cut);
     let set = Dataset::open(&cut).unwrap();
     assert_eq!(set.episodes().iter().map(|e| e.length).collect::<Vec<_>>(), [lengths[0], lengths[2]]);
@@ -389,15 +413,15 @@ fn what_lerobot_wrote_is_edited_and_its_videos_are_cut_without_encoding() {
         assert!(b.data == expected, "{camera}");
     }
     let counts = Parts::Counts(vec![("one".to_owned(), 1), ("two".to_owned(), 2)]);
-    split(&lerobot(), &parts, &counts, None, &mut quiet).unwrap();
-    merge(&[parts.join("one"), parts.join("two")], &again, &mut quiet).unwrap();
+    split(&lerobot(), &parts, &counts, None, &mut going).unwrap();
+    merge(&[parts.join("one"), parts.join("two")], &again, &mut going).unwrap();
     sound(&again);
     let again = Dataset::open(&again).unwrap();
     assert_eq!((again.fingerprint(), again.tasks()), (theirs.fingerprint(), theirs.tasks()));
     assert!(theirs.cameras().all(|camera| again.pictures(camera).unwrap() == theirs.pictures(camera).unwrap()));
     // whole files stay what they were
     let all = dir.path().join("all");
-    keep(&lerobot(), &Destination::New(all.clone()), &numbers(&[0, 1, 2]), &mut quiet).unwrap();
+    keep(&lerobot(), &Destination::New(all.clone()), &numbers(&[0, 1, 2]), &mut going).unwrap();
     let videos = |root: &Path| files(&root.join("videos"));
     assert!(videos(&all) == videos(&lerobot()));
     assert_eq!(Dataset::open(&all).unwrap().stats()[CAMERA], theirs.stats()[CAMERA]);
@@ -407,18 +431,18 @@ fn what_lerobot_wrote_is_edited_and_its_videos_are_cut_without_encoding() {
 fn h264_is_carried_over_in_whole_files_and_never_cut() {
     let dir = tempfile::tempdir().unwrap();
     let set = dir.path().join("set");
-    keep(&lerobot(), &Destination::New(set.clone()), &numbers(&[0, 1, 2]), &mut quiet).unwrap();
+    keep(&lerobot(), &Destination::New(set.clone()), &numbers(&[0, 1, 2]), &mut going).unwrap();
     for camera in ["agentview", "robot0_eye_in_hand"] {
         let from = Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("../video/tests/fixtures/h264_{camera}.mp4"));
         let to = set.join(format!("videos/observation.images.{camera}/chunk-000/file-000.mp4"));
         std::fs::copy(from, to).unwrap();
     }
     let all = dir.path().join("all");
-    keep(&set, &Destination::New(all.clone()), &numbers(&[0, 1, 2]), &mut quiet).unwrap();
+    keep(&set, &Destination::New(all.clone()), &numbers(&[0, 1, 2]), &mut going).unwrap();
     sound(&all);
     assert!(files(&all.join("videos")) == files(&set.join("videos")));
     let part = dir.path().join("part");
-    let told = keep(&set, &Destination::New(part.clone()), &numbers(&[0]), &mut quiet).unwrap_err().to_string();
+    let told = keep(&set, &Destination::New(part.clone()), &numbers(&[0]), &mut going).unwrap_err().to_string();
     assert!(told.contains("file-000.mp4: frames 0 to ") && told.contains("expected av1, found h264"), "{told}");
     assert!(!part.exists());
 }
@@ -442,14 +466,15 @@ fn rewrite_episodes(set: &Path, stays: impl Fn(&str) -> bool, changed: impl Fn(&
 fn videos_whose_pictures_nobody_counted_keep_their_places() {
     let dir = tempfile::tempdir().unwrap();
     let (set, out) = (dir.path().join("set"), dir.path().join("out"));
-    keep(&lerobot(), &Destination::New(set.clone()), &numbers(&[0, 1, 2]), &mut quiet).unwrap();
+    keep(&lerobot(), &Destination::New(set.clone()), &numbers(&[0, 1, 2]), &mut going).unwrap();
     let wanted = Dataset::open(&set).unwrap().pictures(CAMERA).unwrap();
     rewrite_episodes(&set, |name| !name.starts_with("stats/observation.images."), |_, column| Arc::clone(column));
-    without(&set, &Destination::InPlace, &numbers(&[2]), &mut quiet).unwrap();
+    let notes = without(&set, &Destination::InPlace, &numbers(&[2]), &mut going).unwrap().notes;
+    assert!(notes.iter().any(|note| note.starts_with(&format!("statistics of {CAMERA}"))), "{notes:?}");
     let part = Dataset::open(&set).unwrap();
     assert!(wanted.data.starts_with(&part.pictures(CAMERA).unwrap().data));
     // beside one that is counted
-    merge(&[lerobot(), set.clone()], &out, &mut quiet).unwrap();
+    merge(&[lerobot(), set.clone()], &out, &mut going).unwrap();
     let both = Dataset::open(&out).unwrap();
     assert_eq!(both.pictures(CAMERA).unwrap().data, [&wanted.data[..], &part.pictures(CAMERA).unwrap().data].concat());
 }
@@ -458,7 +483,7 @@ fn videos_whose_pictures_nobody_counted_keep_their_places() {
 fn videos_that_are_not_their_sets_are_not_carried_over() {
     let dir = tempfile::tempdir().unwrap();
     let (set, out) = (dir.path().join("set"), dir.path().join("out"));
-    keep(&lerobot(), &Destination::New(set.clone()), &numbers(&[0, 1, 2]), &mut quiet).unwrap();
+    keep(&lerobot(), &Destination::New(set.clone()), &numbers(&[0, 1, 2]), &mut going).unwrap();
     let later = |name: &str, column: &ArrayRef| match name == format!("videos/{CAMERA}/from_timestamp") {
         true => Arc::new(Float64Array::from_iter_values(
             column.as_primitive::<Float64Type>().values().iter().map(|seconds| seconds + 0.6),
@@ -467,7 +492,7 @@ fn videos_that_are_not_their_sets_are_not_carried_over() {
     };
     rewrite_episodes(&set, |_| true, later);
     for some in [&[0, 1, 2][..], &[1, 2]] {
-        let told = keep(&set, &Destination::New(out.clone()), &numbers(some), &mut quiet).unwrap_err().to_string();
+        let told = keep(&set, &Destination::New(out.clone()), &numbers(some), &mut going).unwrap_err().to_string();
         assert!(
             told.contains("file-000.mp4: frame") && told.contains("of episode 2: expected a frame within"),
             "{told}"
@@ -499,28 +524,33 @@ fn what_cannot_be_done_is_told_and_leaves_nothing() {
     };
     let of_demo = Selection { demos: vec!["demo_9".to_owned()], ..Selection::default() };
     let of_mask = |name: &str| Selection { masks: vec![name.to_owned()], ..Selection::default() };
-    told(keep(&set, &new(), &numbers(&[0, 3]), &mut quiet), &["no episode 3; there is 0 to 2"]);
-    told(keep(&set, &new(), &of_demo, &mut quiet), &["no demo demo_9; there is demo_1, demo_2, demo_3"]);
-    told(keep(&set, &new(), &of_mask("test"), &mut quiet), &["no split test; there is", "train, valid"]);
-    told(keep(&set, &new(), &of_mask("valid"), &mut quiet), &["no episode in valid; there is an empty mask"]);
-    told(keep(&set, &new(), &Selection::default(), &mut quiet), &["no episode that was chosen; there is 3"]);
-    told(without(&set, &new(), &numbers(&[0, 1, 2]), &mut quiet), &["no episode that would be left; there is 3"]);
-    told(keep(&set, &Destination::New(other.clone()), &numbers(&[0]), &mut quiet), &["other: exists already"]);
-    told(keep(&out, &Destination::InPlace, &numbers(&[0]), &mut quiet), &["nothing at that path"]);
+    told(keep(&set, &new(), &numbers(&[0, 3]), &mut going), &["no episode 3; there is 0 to 2"]);
+    told(keep(&set, &new(), &of_demo, &mut going), &["no demo demo_9; there is demo_1, demo_2, demo_3"]);
+    told(keep(&set, &new(), &of_mask("test"), &mut going), &["no split test; there is", "train, valid"]);
+    told(keep(&set, &new(), &of_mask("valid"), &mut going), &["no episode in valid; there is an empty mask"]);
+    told(keep(&set, &new(), &Selection::default(), &mut going), &["no episode that was chosen; there is 3"]);
+    told(without(&set, &new(), &numbers(&[0, 1, 2]), &mut going), &["no episode that would be left; there is 3"]);
+    told(keep(&set, &Destination::New(other.clone()), &numbers(&[0]), &mut going), &["other: exists already"]);
+    told(keep(&out, &Destination::InPlace, &numbers(&[0]), &mut going), &["nothing at that path"]);
     told(
-        merge(&[set.clone(), other.clone()], &out, &mut quiet),
+        merge(&[set.clone(), other.clone()], &out, &mut going),
         &["other: features.action: expected float32 [7], as in ", "found float32 [10]"],
     );
-    told(merge(&[set.clone(), fast.clone()], &out, &mut quiet), &["fast: fps: expected 20, as in ", "found 10"]);
+    told(merge(&[set.clone(), fast.clone()], &out, &mut going), &["fast: fps: expected 20, as in ", "found 10"]);
     told(
-        merge(&[set.clone(), fewer.clone()], &out, &mut quiet),
+        merge(&[set.clone(), fewer.clone()], &out, &mut going),
         &["fewer: features.observation.environment_state: expected float32 [10]", "found no such feature"],
     );
     told(
-        merge(&[fewer.clone(), set.clone()], &out, &mut quiet),
+        merge(&[fewer.clone(), set.clone()], &out, &mut going),
         &["set: features.observation.environment_state: expected no such feature", "found one"],
     );
-    told(merge(&[set.clone(), set.clone()], &other, &mut quiet), &["other: exists already"]);
+    told(merge(&[set.clone(), set.clone()], &other, &mut going), &["other: exists already"]);
+    let inside = Destination::New(set.join("inside"));
+    told(keep(&set, &inside, &numbers(&[0]), &mut going), &["inside: output: expected a place outside of "]);
+    assert!(!set.join("inside").exists());
+    let stops = &mut |_, _| std::ops::ControlFlow::Break(());
+    told(keep(&set, &new(), &numbers(&[0]), stops), &["was stopped"]);
     for (old, name, words) in [
         ("reward", "x", &["no feature reward; there is ", "next.reward"][..]),
         ("next.reward", "action", &["new name of next.reward: expected a name that no feature has, found action"]),
@@ -529,9 +559,9 @@ fn what_cannot_be_done_is_told_and_leaves_nothing() {
         ("timestamp", "time", &["expected timestamp, which keeps its name, found time"]),
         ("action", "act", &["expected action, which keeps its name, found act"]),
     ] {
-        told(rename(&set, &new(), &Renames::from([(old.to_owned(), name.to_owned())]), &mut quiet), words);
+        told(rename(&set, &new(), &Renames::from([(old.to_owned(), name.to_owned())]), &mut going), words);
     }
-    let parts = |parts: Parts| split(&set, &out, &parts, None, &mut quiet).map(|mut made| made.remove(0).1);
+    let parts = |parts: Parts| split(&set, &out, &parts, None, &mut going).map(|mut made| made.remove(0).1);
     let two = |a: f64, b: f64| Parts::Fractions(vec![("a".to_owned(), a), ("b".to_owned(), b)]);
     told(parts(two(0.9, 0.2)), &["parts: expected shares above 0, together 1 at most, found a 0.9, b 0.2"]);
     told(parts(two(0.9, 0.1)), &["part b: expected 1 episode or more, found none"]);
@@ -556,7 +586,7 @@ fn what_cannot_be_done_is_told_and_leaves_nothing() {
     let data = "data/chunk-000/file-000.parquet";
     std::fs::copy(two.join(data), one.join(data)).unwrap();
     told(
-        keep(&one, &new(), &numbers(&[0]), &mut quiet),
+        keep(&one, &new(), &numbers(&[0]), &mut going),
         &["one: images: expected the content that was recorded", "fingerprint"],
     );
     // what was changed since it was written is not carried on
@@ -564,5 +594,5 @@ fn what_cannot_be_done_is_told_and_leaves_nothing() {
     let mut text = std::fs::read_to_string(&path).unwrap();
     text.push(' ');
     std::fs::write(&path, text).unwrap();
-    told(keep(&set, &new(), &numbers(&[0]), &mut quiet), &["layout.json: sha256: expected"]);
+    told(keep(&set, &new(), &numbers(&[0]), &mut going), &["layout.json: sha256: expected"]);
 }

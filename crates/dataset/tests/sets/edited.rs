@@ -2,6 +2,7 @@
 
 #![allow(clippy::unwrap_used)]
 
+use crate::common::going;
 use arrow_array::cast::AsArray;
 use arrow_array::types::{Float64Type, Int64Type};
 use arrow_array::{Array, ArrayRef, Float64Array, Int64Array, ListArray, RecordBatch};
@@ -143,7 +144,7 @@ fn sets_with_their_provenance_in_info_json_open_as_before() {
     // an edit moves it
     let (out, all) =
         (dir.path().join("out"), dataset::edit::Selection { episodes: vec![0, 1, 2], ..Default::default() });
-    dataset::edit::keep(&set, &dataset::edit::Destination::New(out.clone()), &all, &mut |_, _| {}).unwrap();
+    dataset::edit::keep(&set, &dataset::edit::Destination::New(out.clone()), &all, &mut going).unwrap();
     assert_eq!(trained_on(&out).unwrap(), as_it_was);
     assert!(out.join("actrm/info.json").exists());
 }

@@ -5,11 +5,13 @@ mod common;
 #[path = "../common/made.rs"]
 mod made;
 
+mod columns;
 mod depth;
 mod edit;
 mod edited;
 mod layouts;
 mod lerobot;
 mod planted;
+mod planting;
 mod unclean;
 mod videos;

@@ -158,6 +158,11 @@ fn a_shard_that_was_stopped_is_converted_again_and_a_complete_one_stays() {
     let again = convert_shard(&source, &folder, &options, shard, &mut on).unwrap();
     assert!(again.resumed && (again.episodes, again.bytes) == (made.episodes, made.bytes));
     assert_eq!(files(&folder), bytes);
+    // a shard that lacks a file is not complete
+    std::fs::rename(folder.join("rest.bin"), dir.path().join("rest.bin")).unwrap();
+    let refused = convert_shard(&source, &folder, &options, shard, &mut on).unwrap_err().to_string();
+    assert!(refused.contains("rest.bin: shard 2/2: expected the file") && refused.contains("again"), "{refused}");
+    std::fs::rename(dir.path().join("rest.bin"), folder.join("rest.bin")).unwrap();
     // another shard, other options
     let other = ConvertOptions { lossless: false, ..plain() };
     for (options, shard) in [(&options, Shard { index: 1, of: 2 }), (&other, shard)] {

@@ -6,9 +6,10 @@
 #[path = "sources/mod.rs"]
 mod sources;
 
+use crate::common::going;
 use dataset::{
     Array, ConvertOptions, ConvertReport, Dataset, DatasetError, Demo, NonFinite, RobomimicWriter, Source,
-    WriteOptions, convert, edit, export, verify, verify_source,
+    WriteOptions, convert, edit, export, rewrite, verify, verify_source,
 };
 use std::path::{Path, PathBuf};
 
@@ -112,7 +113,7 @@ impl Place {
 /// The set without its first episode.
 fn without_first(set: &Path, out: &Path) {
     let first = edit::Selection { episodes: vec![0], ..edit::Selection::default() };
-    edit::without(set, &edit::Destination::New(out.to_owned()), &first, &mut quiet).unwrap();
+    edit::without(set, &edit::Destination::New(out.to_owned()), &first, &mut going).unwrap();
 }
 
 /// Puts a value at a place of a dataset.
@@ -277,6 +278,26 @@ fn a_bad_demo_is_left_out_with_its_reason_where_that_is_asked() {
 }
 
 #[test]
+fn masks_name_no_demo_that_was_left_out() {
+    let place = Place(tempfile::tempdir().unwrap());
+    let mut demos: Vec<Demo> = (0..3).map(demo).collect();
+    plant(&mut demos[2], "obs/object", 0, f64::NAN);
+    let masks: [(&str, &[&str]); 2] = [("train", &["demo_0", "demo_2"]), ("valid", &["demo_1", "demo_9"])];
+    write(&place.file(), &demos, &masks);
+    place.convert(&skipping()).unwrap();
+    let absent = |notes: &[String]| notes.iter().filter(|note| note.contains("not in the file")).count();
+    let notes = dataset::notes(&place.set()).unwrap();
+    assert!(absent(&notes) == 1 && notes[0].contains("demo_9"), "{notes:?}");
+    let again = place.0.path().join("again.hdf5");
+    export(&place.set(), &again, &WriteOptions::default(), &mut quiet).unwrap();
+    let masks = Source::open(&again).unwrap().plan().masks.clone();
+    assert_eq!(
+        (&*masks["train"], &*masks["valid"]),
+        (&["demo_0".to_owned()][..], &["demo_1", "demo_9"].map(String::from)[..])
+    );
+}
+
+#[test]
 fn demos_that_are_all_bad_are_an_error() {
     let mut demos: Vec<Demo> = (0..2).map(demo).collect();
     demos.iter_mut().for_each(|demo| plant(demo, "obs/object", 0, f64::NAN));
@@ -372,6 +393,11 @@ fn a_key_that_cannot_be_read_is_left_out_unless_it_is_asked_for() {
     assert_eq!(report.notes.iter().filter(|note| note.contains("obs/object")).count(), 1, "{:?}", report.notes);
     assert_eq!(Dataset::open(&place.set()).unwrap().provenance().unwrap().left_out, ["obs/object"]);
     export(&place.set(), &place.0.path().join("again.hdf5"), &WriteOptions::default(), &mut quiet).unwrap();
+    // a file that is made of the file says so too
+    let rewritten = place.0.path().join("rewritten.hdf5");
+    let options = WriteOptions::default();
+    let notes = rewrite(&place.file(), &rewritten, NonFinite::Refuse, &options, &mut quiet).unwrap().notes;
+    assert!(notes.iter().any(|note| note.starts_with("obs/object is left out in 2 of 2 demos: ")), "{notes:?}");
 }
 
 /// Adds to a file what only libhdf5 itself makes.

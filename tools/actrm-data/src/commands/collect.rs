@@ -70,7 +70,7 @@ pub struct Args {
 pub fn run(args: &Args) -> Result<ExitCode> {
     let start = Instant::now();
     recording::refuse_existing(&args.out)?;
-    cli::make_parent(&args.out)?;
+    let _parents = cli::make_parent(&args.out)?;
     let stop = Stop::install(GOES_ON)?;
     let mut spec = args.simulator.spec(&args.task)?;
     if !args.robots.is_empty() {

@@ -1,4 +1,4 @@
-use crate::parents::Parents;
+use crate::work::Work;
 use anyhow::{Result, anyhow, bail};
 use dataset::{
     ActionKind, ConvertOptions, ConvertReport, DatasetError, ImageForm, InputError, NonFinite, RotationForm, Shard,
@@ -6,7 +6,6 @@ use dataset::{
 };
 use serde_json::json;
 use std::collections::BTreeMap;
-use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Instant;
@@ -235,12 +234,12 @@ fn to_robomimic(args: &Args) -> Result<ExitCode> {
         return super::export::run(&export);
     }
     let nonfinite = args.nonfinite.into();
-    let _parents = Parents::make(&args.out)?;
+    let _work = Work::begin(&args.out)?;
     let mut screen = cli::Screen::new();
     let options = WriteOptions { gzip: args.gzip };
     let report = dataset::rewrite(&args.source, &args.out, nonfinite, &options, &mut screen.advance("converting"));
     screen.clear();
-    super::export::tell(&export, report?)
+    super::export::tell(&export, report.map_err(|error| advised(error, None))?)
 }
 
 impl From<Nonfinite> for NonFinite {
@@ -301,10 +300,15 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     if let Some(shard) = args.shard {
         return convert_shard(args, &options, shard);
     }
-    let _parents = Parents::make(&args.out)?;
+    let work = Work::begin(&args.out)?;
     let start = Instant::now();
     let mut screen = cli::Screen::new();
-    let report = dataset::convert(&args.source, &args.out, &options, &mut screen.advance("converting"));
+    let mut advance = screen.advance("converting");
+    let report = dataset::convert_unless(&args.source, &args.out, &options, &mut |done, total| {
+        advance(done, total);
+        work.goes_on()
+    });
+    drop(advance);
     screen.clear();
     let set = args.source.join("meta/info.json").exists();
     let report = report
@@ -336,12 +340,12 @@ fn convert_shard(args: &Args, options: &ConvertOptions, shard: Shard) -> Result<
         }
         return Ok(ExitCode::SUCCESS);
     }
-    let _parents = Parents::make(&args.out)?;
+    let work = Work::begin(&args.out)?;
     let mut screen = cli::Screen::new();
     let mut advance = screen.advance("converting");
     let report = dataset::convert_shard(&args.source, &args.out, options, shard, &mut |done, total| {
         advance(done, total);
-        ControlFlow::Continue(())
+        work.goes_on()
     });
     drop(advance);
     screen.clear();

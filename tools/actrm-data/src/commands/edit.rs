@@ -1,4 +1,4 @@
-use crate::parents::Parents;
+use crate::work::Work;
 use anyhow::Result;
 use dataset::edit::{self, Destination, EditReport, Parts, Renames, Selection};
 use serde_json::{Value, json};
@@ -9,8 +9,9 @@ use std::process::ExitCode;
 ///
 /// Works on LeRobotDataset v3.0 directories, ours or LeRobot's. Images and videos are carried over as they are stored;
 /// numbers, tasks, masks, statistics, fingerprint and the side folder follow from the episodes that the result has, as if it
-/// had been converted. Sources are never touched, and a result appears whole or not at all. Of a video file of which some
-/// episodes are left out, those of the others are cut out without encoding them again: AV1 can be cut, H.264 is refused.
+/// had been converted. Columns that other programs added to meta/episodes go with their episodes. Sources are never touched,
+/// and a result appears whole or not at all. Of a video file of which some episodes are left out, those of the others are cut
+/// out without encoding them again: AV1 can be cut, H.264 is refused.
 #[derive(clap::Args)]
 #[command(
     subcommand_required = true,
@@ -87,7 +88,8 @@ struct OneSet {
     /// Directory to create
     #[arg(required_unless_present = "in_place", conflicts_with = "in_place")]
     out: Option<PathBuf>,
-    /// Put the result in the place of SET, at once and only when it is complete
+    /// Put the result in the place of SET, at once and only when it is complete. What lies in SET beside the data set
+    /// (README.md, .git) stays
     #[arg(long)]
     in_place: bool,
     /// Report as JSON
@@ -188,15 +190,21 @@ fn pair<T: std::str::FromStr>(text: &str) -> Result<(String, T), String> {
     Ok((name.trim().to_owned(), value))
 }
 
+impl Operation {
+    /// Where the result is.
+    fn out(&self) -> &Path {
+        match self {
+            Self::Drop(Chosen { sets, .. }) | Self::Keep(Chosen { sets, .. }) => sets.result(),
+            Self::Rename(Rename { sets, .. }) | Self::Repair(Repair { sets, .. }) => sets.result(),
+            Self::Split(split) => &split.out,
+            Self::Merge(merge) => &merge.out,
+        }
+    }
+}
+
 impl OneSet {
-    fn destination(&self) -> Result<Destination> {
-        Ok(match &self.out {
-            Some(out) => {
-                cli::make_parent(out)?;
-                Destination::New(out.clone())
-            }
-            None => Destination::InPlace,
-        })
+    fn destination(&self) -> Destination {
+        self.out.clone().map_or(Destination::InPlace, Destination::New)
     }
 
     /// Where the result is.
@@ -226,41 +234,44 @@ impl By {
 }
 
 pub fn run(args: &Args) -> Result<ExitCode> {
+    let work = Work::begin(args.operation.out())?;
     let mut screen = cli::Screen::new();
-    let mut advance = screen.advance("copying");
+    let mut copied = screen.advance("copying");
+    let mut advance = |done, total| {
+        copied(done, total);
+        work.goes_on()
+    };
     let (made, json) = match &args.operation {
         Operation::Drop(Chosen { sets, which }) => {
-            let report = edit::without(&sets.set, &sets.destination()?, &which.selection(), &mut advance)?;
+            let report = edit::without(&sets.set, &sets.destination(), &which.selection(), &mut advance)?;
             (vec![(sets.result().to_path_buf(), report)], sets.json)
         }
         Operation::Keep(Chosen { sets, which }) => {
-            let report = edit::keep(&sets.set, &sets.destination()?, &which.selection(), &mut advance)?;
+            let report = edit::keep(&sets.set, &sets.destination(), &which.selection(), &mut advance)?;
             (vec![(sets.result().to_path_buf(), report)], sets.json)
         }
         Operation::Split(split) => {
-            let _parents = Parents::make(&split.out)?;
             let made = edit::split(&split.set, &split.out, &split.parts.parts(), split.seed, &mut advance)?;
             (made.into_iter().map(|(name, report)| (split.out.join(name), report)).collect(), split.json)
         }
         Operation::Merge(merge) => {
-            let _parents = Parents::make(&merge.out)?;
             let report = edit::merge(&merge.sets, &merge.out, &mut advance)?;
             (vec![(merge.out.clone(), report)], merge.json)
         }
         Operation::Rename(Rename { sets, features }) => {
             let renames: Renames = super::convert::once("--feature", features)?;
-            let report = edit::rename(&sets.set, &sets.destination()?, &renames, &mut advance)?;
+            let report = edit::rename(&sets.set, &sets.destination(), &renames, &mut advance)?;
             (vec![(sets.result().to_path_buf(), report)], sets.json)
         }
         Operation::Repair(Repair { sets, timestamps }) => {
             let what = edit::Repair { timestamps: *timestamps };
-            let report = edit::repair(&sets.set, &sets.destination()?, what, &mut advance)?;
-            drop(advance);
+            let report = edit::repair(&sets.set, &sets.destination(), what, &mut advance)?;
+            drop(copied);
             screen.clear();
             return tell_repair(sets, report);
         }
     };
-    drop(advance);
+    drop(copied);
     screen.clear();
     tell(&made, json)?;
     Ok(ExitCode::SUCCESS)

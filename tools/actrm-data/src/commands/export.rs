@@ -1,4 +1,4 @@
-use crate::parents::Parents;
+use crate::work::Work;
 use anyhow::Result;
 use dataset::{ExportReport, WriteOptions};
 use serde_json::json;
@@ -28,7 +28,7 @@ pub struct Args {
 }
 
 pub fn run(args: &Args) -> Result<ExitCode> {
-    let _parents = Parents::make(&args.out)?;
+    let _work = Work::begin(&args.out)?;
     let mut screen = cli::Screen::new();
     let options = WriteOptions { gzip: args.gzip };
     let report = dataset::export(&args.dir, &args.out, &options, &mut screen.advance("exporting"));

@@ -40,7 +40,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let source = Source::open_guarded(&args.raw)?;
     let task = recorded_task(&args.raw, &source)?;
     recording::refuse_existing(&args.out)?;
-    cli::make_parent(&args.out)?;
+    let _parents = cli::make_parent(&args.out)?;
     let stop = Stop::install("stopped; nothing was written")?;
     let out = args.out.clone();
     stop.last_act(move || dataset::remove_unfinished(&out));

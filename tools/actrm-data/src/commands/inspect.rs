@@ -17,7 +17,7 @@ use std::process::ExitCode;
 pub struct Args {
     /// Anything that `convert` takes, or a data set directory
     path: PathBuf,
-    /// Do not read the data: no ranges
+    /// Do not read a file's data: no ranges. Those of a data set are stored
     #[arg(long)]
     quick: bool,
     /// List every demo

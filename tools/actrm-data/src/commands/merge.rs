@@ -1,6 +1,5 @@
-use crate::parents::Parents;
+use crate::work::Work;
 use anyhow::Result;
-use std::ops::ControlFlow;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Instant;
@@ -27,13 +26,13 @@ pub struct Args {
 }
 
 pub fn run(args: &Args) -> Result<ExitCode> {
-    let _parents = Parents::make(&args.out)?;
+    let work = Work::begin(&args.out)?;
     let start = Instant::now();
     let mut screen = cli::Screen::new();
     let mut advance = screen.advance("merging");
     let report = dataset::merge_shards(&args.out, &args.shards, &mut |done, total| {
         advance(done, total);
-        ControlFlow::Continue(())
+        work.goes_on()
     });
     drop(advance);
     screen.clear();

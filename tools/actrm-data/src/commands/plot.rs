@@ -23,7 +23,7 @@ pub struct Args {
     /// Episode to plot
     #[arg(long, default_value_t = 0)]
     episode: usize,
-    /// Column or camera to plot, by name; may be repeated [default: actions, observations and rewards; all cameras]
+    /// Column or camera to plot, by name; may be repeated [default: all numeric columns; of a .png file all cameras]
     #[arg(long, value_name = "NAME")]
     column: Vec<String>,
     /// Number of frames of a .png file, evenly spread
@@ -139,7 +139,7 @@ pub(super) fn create(path: &Path, bytes: &[u8]) -> Result<()> {
     if path.exists() {
         bail!("{}: exists already; choose another path or remove it first", path.display());
     }
-    cli::make_parent(path)?;
+    let _parents = cli::make_parent(path)?;
     let parent = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let mut name = OsString::from(".");
     name.push(path.file_name().unwrap_or_default());

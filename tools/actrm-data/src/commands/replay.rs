@@ -1,3 +1,4 @@
+use crate::work::STOPPED;
 use anyhow::{Context, Result, bail};
 use cli::{INTERRUPTED, Screen, SimulatorArgs, Stop, VideoWriter};
 use dataset::{Demo, Source, WriteOptions};
@@ -46,6 +47,9 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     recording::refuse_existing(&args.video)?;
     // a data set is taken back to the file that it was made of
     let rebuilt = tempfile::tempdir().context("a folder for the rebuilt file")?;
+    let stop = Stop::install(STOPPED)?;
+    let folder = rebuilt.path().to_owned();
+    stop.last_act(move || drop(std::fs::remove_dir_all(folder)));
     let file = match args.input.is_dir() {
         true => rebuild(&args.input, rebuilt.path())?,
         false => args.input.clone(),
@@ -59,11 +63,10 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         bail!("{}: {id}: states: expected {steps} rows, one an action and at least one, found {found}", file.display());
     }
 
-    let stop = Stop::install("stopped; nothing was written")?;
     let mut spec = args.simulator.recorded_spec(&task, env_args.as_ref())?;
     (spec.cameras, spec.image_size) = (vec![args.camera.clone()], usize::from(args.size));
     let Some(mut pool) = args.simulator.start(spec, None, &stop)? else {
-        cli::note("stopped; nothing was written");
+        cli::note(STOPPED);
         return Ok(ExitCode::from(INTERRUPTED));
     };
     let size = (usize::from(args.size), usize::from(args.size));

@@ -6,7 +6,8 @@ use std::process::ExitCode;
 
 /// Show a data set's statistics, dimension by dimension.
 ///
-/// Statistics of the whole set are read from its files. Statistics of a split or of single episodes are computed.
+/// Statistics of the whole set are read from its files. Statistics of a split or of single episodes are computed, without
+/// those of images, depth and index columns.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-data stats lift
@@ -33,12 +34,17 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let set = Dataset::open(&args.dir)?;
     let mut stats = match (&args.split, &args.episodes) {
         (Some(split), _) => match set.split(split) {
-            Some(episodes) => set.statistics_of(&episodes)?,
+            Some(episodes) => set.exact_statistics_of(&episodes)?,
             None => bail!("{}: no split {split}; there is {}", args.dir.display(), set.split_names().join(", ")),
         },
-        (None, Some(episodes)) => set.statistics_of(episodes)?,
+        (None, Some(episodes)) => set.exact_statistics_of(episodes)?,
         (None, None) => set.stats().clone(),
     };
+    let left_out: Vec<&str> =
+        set.stats().keys().map(String::as_str).filter(|name| !stats.contains_key(*name)).collect();
+    if !left_out.is_empty() {
+        cli::note(&format!("note: not computed, and left out: {}", left_out.join(", ")));
+    }
     if let Some(text) = &args.feature {
         stats.retain(|name, _| name.contains(text.as_str()));
         if stats.is_empty() {

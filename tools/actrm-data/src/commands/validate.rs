@@ -23,19 +23,27 @@ pub struct Args {
     /// File or folder that the data set was converted from: compare it with the hash recorded then
     #[arg(long, value_name = "FILE")]
     source: Option<PathBuf>,
-    /// Seconds that timestamps of a data set may be off, as LeRobot's tolerance_s
-    #[arg(long, value_name = "SECONDS", default_value_t = dataset::TIME_TOLERANCE)]
-    tolerance: f64,
+    /// Seconds that timestamps of a data set may be off, as LeRobot's tolerance_s [default: 0.0001]
+    #[arg(long, value_name = "SECONDS", value_parser = seconds)]
+    tolerance: Option<f64>,
     /// As JSON
     #[arg(long)]
     json: bool,
+}
+
+fn seconds(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(v) if v.is_finite() && v >= 0.0 => Ok(v),
+        _ => Err("expected a number, 0 or more".to_owned()),
+    }
 }
 
 pub fn run(args: &Args) -> Result<ExitCode> {
     let mut notes = Vec::new();
     let checks = if args.path.join("meta/info.json").exists() {
         let mut screen = cli::Screen::new();
-        let checks = dataset::verify_within(&args.path, args.tolerance, &mut screen.advance("checking"));
+        let tolerance = args.tolerance.unwrap_or(dataset::TIME_TOLERANCE);
+        let checks = dataset::verify_within(&args.path, tolerance, &mut screen.advance("checking"));
         screen.clear();
         let mut checks = checks?;
         // where they cannot be had, a check says why
@@ -44,8 +52,8 @@ pub fn run(args: &Args) -> Result<ExitCode> {
             checks.push(dataset::verify_source(&args.path, source)?);
         }
         checks
-    } else if args.source.is_some() {
-        bail!("{}: --source belongs to a data set directory, expected meta/info.json in it", args.path.display());
+    } else if let Some(option) = args.source.as_ref().map(|_| "--source").or(args.tolerance.map(|_| "--tolerance")) {
+        bail!("{}: {option} belongs to a data set directory, expected meta/info.json in it", args.path.display());
     } else {
         check_source(args, &mut notes)?
     };

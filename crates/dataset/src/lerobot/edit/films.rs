@@ -8,7 +8,7 @@ use super::super::pictures::{Film, VideoPlace, places};
 use super::super::read::refuse_pointer;
 use super::super::shards::{HashingFile, WrittenFile, create_parent};
 use super::super::videos::{Stretch, rate};
-use super::Edit;
+use super::{Advance, Edit};
 use crate::error::{DatasetError, Result};
 use rayon::prelude::*;
 use sha2::{Digest, Sha256};
@@ -31,7 +31,7 @@ pub(super) struct Copied {
 /// # Errors
 /// [`VideoError::Cut`] where part of a file is taken whose samples cannot be: H.264, or an episode that does not begin
 /// with a key frame.
-pub(super) fn copy(edit: &Edit<'_>, name: &str, advance: &mut dyn FnMut(u64)) -> Result<Copied> {
+pub(super) fn copy(edit: &Edit<'_>, name: &str, advance: &mut Advance<'_>) -> Result<Copied> {
     let old = edit.before(name);
     let mut copied = Copied { stretches: Vec::new(), pictures: Vec::new(), files: Vec::new() };
     for (input, taken) in edit.inputs.iter().zip(&edit.taken) {
@@ -40,12 +40,13 @@ pub(super) fn copy(edit: &Edit<'_>, name: &str, advance: &mut dyn FnMut(u64)) ->
         let mut film = Film::new(set.info().fps, (height, width));
         let mut stretches: Vec<Option<Stretch>> = vec![None; places.len()];
         if input.joins {
-            join(edit, set, (name, old), &places, &mut film, &mut stretches, &mut copied.files)?;
+            join(edit, set, (name, old), &places, &mut film, (&mut stretches, &mut copied.files), advance)?;
         }
         for &episode in taken {
             if stretches[episode].is_some() {
                 continue;
             }
+            advance(0)?;
             // every episode of the file that this one is in
             let of_file: Vec<usize> = (0..places.len()).filter(|&e| places[e].path == places[episode].path).collect();
             let wanted: Vec<usize> = of_file.iter().copied().filter(|e| taken.binary_search(e).is_ok()).collect();
@@ -62,8 +63,11 @@ pub(super) fn copy(edit: &Edit<'_>, name: &str, advance: &mut dyn FnMut(u64)) ->
             }
         }
         copied.stretches.extend(taken.iter().map(|&e| stretches[e].expect("each episode taken lies in a file")));
-        copied.pictures.extend(digests(edit, set, old, &places, taken)?);
-        advance(taken.iter().map(|&e| set.episodes()[e].length as u64).sum());
+        // some at a time, so that the work can be given up
+        for some in taken.chunks(AT_ONCE * rayon::current_num_threads()) {
+            copied.pictures.extend(digests(edit, set, old, &places, some)?);
+            advance(some.iter().map(|&e| set.episodes()[e].length as u64).sum())?;
+        }
     }
     Ok(copied)
 }
@@ -76,13 +80,14 @@ fn join(
     (name, old): (&str, &str),
     places: &[VideoPlace],
     film: &mut Film,
-    stretches: &mut [Option<Stretch>],
-    files: &mut Vec<WrittenFile>,
+    (stretches, files): (&mut [Option<Stretch>], &mut Vec<WrittenFile>),
+    advance: &mut Advance<'_>,
 ) -> Result<()> {
     let limit = (set.info().video_files_size_in_mb * f64::from(1 << 20)) as u64;
     let bytes = |episode: usize| std::fs::metadata(&places[episode].path).map_or(0, |m| m.len());
     let mut next = 0;
     while next < places.len() {
+        advance(0)?;
         let (mut together, mut size) = (Vec::new(), 0);
         while next < places.len()
             && (together.is_empty() || size + bytes(next) < limit)
@@ -117,6 +122,8 @@ fn moves(set: &Dataset, place: &VideoPlace, episode: usize) -> Result<bool> {
     }
 }
 
+/// Episodes of a thread that are decoded before it is told how far they are.
+const AT_ONCE: usize = 8;
 /// Bytes that are copied at once.
 const COPIED: usize = 1 << 20;
 

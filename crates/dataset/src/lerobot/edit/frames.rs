@@ -2,7 +2,6 @@
 //! for statistics and digests. Pictures stay the files that they are.
 
 use super::super::chooser::index_columns;
-use super::super::depth;
 use super::super::encode::{ColumnSummary, PartSummary, PictureSummary, add_to_histograms, sample};
 use super::super::export::Rows;
 use super::super::fingerprint::INDEX_COLUMNS;
@@ -17,9 +16,9 @@ use super::super::tally::{Tally, Told};
 use super::super::tiff;
 use super::super::values::Values;
 use super::super::work::{GROUP_BYTES, Part};
-use super::Edit;
 use super::films::Copied as Filmed;
 use super::groups::Groups;
+use super::{Advance, Edit};
 use crate::error::{DatasetError, Result};
 use crate::stats::FeatureStats;
 use arrow_array::{Array, ArrayRef, BooleanArray, Float32Array, Float64Array, Int64Array, RecordBatch, StructArray};
@@ -29,7 +28,7 @@ use parquet::file::metadata::KeyValue;
 use rayon::prelude::*;
 use serde_json::{Map, Value};
 use sha2::{Digest, Sha256};
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::path::Path;
 use std::sync::Arc;
 
@@ -42,14 +41,33 @@ pub(super) struct Copied {
 }
 
 /// Whether the pictures of a feature are decoded for their statistics; others keep what is stored of them.
-pub(super) fn is_looked_at(feature: &Feature) -> bool {
+pub(in crate::lerobot) fn is_looked_at(feature: &Feature) -> bool {
     let channels = if feature.is_depth() { 1 } else { 3 };
     feature.dtype == "image"
         && matches!(feature.shape[..], [height, width, c] if height > 0 && width > 0 && c == channels)
 }
 
+/// Task texts, each with its number.
+#[derive(Default)]
+struct Tasks {
+    texts: Vec<String>,
+    numbers: HashMap<String, usize>,
+}
+
+impl Tasks {
+    /// The number of a text, which is the next one where it has none.
+    fn number(&mut self, text: &str) -> usize {
+        if let Some(&number) = self.numbers.get(text) {
+            return number;
+        }
+        self.texts.push(text.to_owned());
+        self.numbers.insert(text.to_owned(), self.texts.len() - 1);
+        self.texts.len() - 1
+    }
+}
+
 /// Copies the rows of all episodes taken, whose videos are in `films`.
-pub(super) fn copy(edit: &Edit<'_>, mut films: Vec<(usize, Filmed)>, advance: &mut dyn FnMut(u64)) -> Result<Copied> {
+pub(super) fn copy(edit: &Edit<'_>, mut films: Vec<(usize, Filmed)>, advance: &mut Advance<'_>) -> Result<Copied> {
     let info = edit.inputs[0].set.info();
     let (names, schema, metadata) = written_as(edit)?;
     let encoder = schema::writer_properties(&schema, metadata.into_iter().collect())
@@ -63,7 +81,10 @@ pub(super) fn copy(edit: &Edit<'_>, mut films: Vec<(usize, Filmed)>, advance: &m
     let mut shards = ShardWriter::new(edit.root, "data", &encoder, limit, FILES_PER_FOLDER);
     let mut append = |group, begins| shards.append(group, begins);
     let mut groups = Groups::new(edit.root, &encoder, limit);
-    let (mut tasks, mut tally) = (edit.tasks(), Tally::new(&edit.features, info.fps, edit.root));
+    let (mut tasks, mut tally) = (Tasks::default(), Tally::new(&edit.features, info.fps, edit.root));
+    for text in edit.tasks() {
+        tasks.number(&text);
+    }
     // episodes whose place is not known yet
     let mut waiting: VecDeque<(PartSummary, Vec<usize>)> = VecDeque::new();
     let mut settle = |groups: &mut Groups<'_>, waiting: &mut VecDeque<(PartSummary, Vec<usize>)>, texts: &[String]| {
@@ -97,7 +118,7 @@ pub(super) fn copy(edit: &Edit<'_>, mut films: Vec<(usize, Filmed)>, advance: &m
                 rows.skip(episode.length)?;
                 continue;
             }
-            let own = episode.tasks.iter().map(|text| number_of(&mut tasks, text)).collect();
+            let own = episode.tasks.iter().map(|text| tasks.number(text)).collect();
             let part = Part { episode: number, length: episode.length, first_frame: frames, rows: 0..episode.length };
             let mut seen = Seen::new(edit, set, &schema, part, episode);
             groups.begin(episode.length, &mut append)?;
@@ -109,22 +130,15 @@ pub(super) fn copy(edit: &Edit<'_>, mut films: Vec<(usize, Filmed)>, advance: &m
                 }
             }
             frames += episode.length;
-            advance(episode.length as u64);
+            advance(episode.length as u64)?;
             number += 1;
             waiting.push_back((seen.summary(&stored), own));
-            settle(&mut groups, &mut waiting, &tasks)?;
+            settle(&mut groups, &mut waiting, &tasks.texts)?;
         }
     }
     groups.finish(&mut append)?;
-    settle(&mut groups, &mut waiting, &tasks)?;
-    Ok(Copied { files: shards.finish()?, tasks, told: tally.finish()? })
-}
-
-fn number_of(tasks: &mut Vec<String>, text: &str) -> usize {
-    tasks.iter().position(|t| t == text).unwrap_or_else(|| {
-        tasks.push(text.to_owned());
-        tasks.len() - 1
-    })
+    settle(&mut groups, &mut waiting, &tasks.texts)?;
+    Ok(Copied { files: shards.finish()?, tasks: tasks.texts, told: tally.finish()? })
 }
 
 /// Adds the features of index columns that the first set's data files have and its `info.json` does not state.
@@ -297,7 +311,7 @@ impl<'a> Seen<'a> {
     }
 
     /// The columns with the numbers that they have in the result.
-    fn numbered(&self, mut arrays: Vec<ArrayRef>, tasks: &mut Vec<String>) -> Result<Vec<ArrayRef>> {
+    fn numbered(&self, mut arrays: Vec<ArrayRef>, tasks: &mut Tasks) -> Result<Vec<ArrayRef>> {
         let path = self.set.root().join("data");
         let rows = arrays.first().map_or(0, |a| a.len());
         let as_type = |array: &ArrayRef, to: &DataType| {
@@ -315,7 +329,7 @@ impl<'a> Seen<'a> {
             (frame, counting(self.rows)),
         ];
         if let (Some(at), Some(_), [task]) = (task, self.edit.repair, self.tasks()) {
-            numbers.push((Some(at), vec![number_of(tasks, task) as i64; rows]));
+            numbers.push((Some(at), vec![tasks.number(task) as i64; rows]));
         } else if let Some(at) = task {
             let mut known: BTreeMap<i64, i64> = BTreeMap::new();
             let mut new = Vec::with_capacity(rows);
@@ -323,7 +337,7 @@ impl<'a> Seen<'a> {
                 new.push(match known.get(&old) {
                     Some(&new) => new,
                     None => {
-                        let number = number_of(tasks, self.task(&path, old)?) as i64;
+                        let number = tasks.number(self.task(&path, old)?) as i64;
                         *known.entry(old).or_insert(number)
                     }
                 });
@@ -401,16 +415,16 @@ impl<'a> Seen<'a> {
             }
             let mut pixels = Vec::with_capacity(feature.picture_bytes());
             let file = files.value(row);
+            // depth that is not finite was kept on purpose, and statistics are those of the rest
             let decoded = match feature.is_depth() {
-                true => tiff::decode(file, height, width, &mut pixels)
-                    .and_then(|kind| depth::not_finite(kind, width, &pixels).map_or(Ok(Some(kind)), Err)),
+                true => tiff::decode(file, height, width, &mut pixels).map(Some),
                 false => images::decode(file, height, width, &mut pixels).map(|()| None),
             };
             let kind = decoded.map_err(|found| DatasetError::BadDataset {
                 path: self.set.root().join("data"),
                 object: format!("column {name}, frame {} of episode {}", first + row, self.episode),
                 expected: match feature.is_depth() {
-                    true => format!("a TIFF file with {height} x {width} of finite depth"),
+                    true => format!("a TIFF file with {height} x {width} of depth"),
                     false => format!("a PNG or PPM image of {height} x {width}"),
                 },
                 found,

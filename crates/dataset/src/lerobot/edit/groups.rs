@@ -24,6 +24,8 @@ pub(super) struct Groups<'a> {
     /// Bytes of a row, as far as rows were seen.
     row_bytes: u64,
     places: VecDeque<Place>,
+    /// Where the last group is.
+    last: Place,
 }
 
 /// Where a row group is appended.
@@ -42,6 +44,7 @@ impl<'a> Groups<'a> {
             started: 0,
             row_bytes: 0,
             places: VecDeque::new(),
+            last: Place { folder: 0, file: 0 },
         }
     }
 
@@ -86,8 +89,8 @@ impl<'a> Groups<'a> {
             let pieces: Vec<&dyn Array> = self.pieces.iter().map(|piece| piece[column].as_ref()).collect();
             arrays.push(concat(&pieces).map_err(|e| failed(e.into()))?);
         }
-        let place = append(self.encoder.encode(&arrays).map_err(failed)?, self.begins)?;
-        self.places.extend(std::iter::repeat_n(place, self.started));
+        self.last = append(self.encoder.encode(&arrays).map_err(failed)?, self.begins)?;
+        self.places.extend(std::iter::repeat_n(self.last, self.started));
         self.pieces.clear();
         (self.rows, self.bytes, self.begins, self.started) = (0, 0, false, 0);
         Ok(())
@@ -98,8 +101,43 @@ impl<'a> Groups<'a> {
         self.places.pop_front()
     }
 
-    /// Closes the last group.
+    /// Closes the last group. Episodes without frames that are in none are placed with the last that has some.
     pub(super) fn finish(&mut self, append: &mut Append<'_>) -> Result<()> {
-        self.flush(append)
+        self.flush(append)?;
+        self.places.extend(std::iter::repeat_n(self.last, std::mem::take(&mut self.started)));
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::super::super::schema::writer_properties;
+    use super::*;
+    use arrow_array::Int64Array;
+    use arrow_schema::{DataType, Field, Schema};
+    use std::sync::Arc;
+
+    #[test]
+    fn episodes_without_frames_have_a_place_wherever_they_come() {
+        let schema = Schema::new(vec![Field::new("x", DataType::Int64, false)]);
+        let properties = writer_properties(&schema, Vec::new()).unwrap();
+        let encoder = GroupEncoder::new(Arc::new(schema), properties).unwrap();
+        let root = Path::new("set");
+        // so small that each episode is a group of its own
+        let mut groups = Groups::new(root, &encoder, 1);
+        let mut file = 0..;
+        let mut append = |_: EncodedGroup, _| Ok(Place { folder: 0, file: file.next().unwrap() });
+        for length in [0, 3, 0, 2, 0, 0] {
+            groups.begin(length, &mut append).unwrap();
+            if length > 0 {
+                let rows: ArrayRef = Arc::new(Int64Array::from(vec![7; length]));
+                groups.push(vec![rows], &mut append).unwrap();
+                groups.flush(&mut append).unwrap();
+            }
+        }
+        groups.finish(&mut append).unwrap();
+        let files: Vec<usize> = std::iter::from_fn(|| groups.next_place()).map(|place| place.file).collect();
+        assert_eq!(files, [0, 0, 1, 1, 1, 1]);
     }
 }

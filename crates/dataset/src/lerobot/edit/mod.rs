@@ -9,27 +9,35 @@ mod films;
 mod frames;
 mod groups;
 mod origin;
+mod other_columns;
 mod repair;
 mod select;
 mod side;
+mod splits;
 
+pub(in crate::lerobot) use frames::is_looked_at;
 pub(crate) use frames::statistics_in;
+pub(in crate::lerobot) use other_columns::is_own;
 pub use repair::{Repair, RepairReport, repair};
 pub use select::{Parts, Selection};
+pub(in crate::lerobot) use side::texts_like;
 
 use super::check;
 use super::export::side_folder;
 use super::info::{self, Feature, Features, Info};
 use super::meta;
 use super::open::{ACTION, Dataset};
+use super::other_files::other_files;
 use super::side::{Layout, write_manifest};
 use super::staging::Staging;
 use super::verify::picture_problem;
 use super::videos::VIDEO_PATH;
 use crate::error::{DatasetError, Result};
-use std::collections::BTreeMap;
+use crate::source::list;
+use std::collections::{BTreeMap, BTreeSet};
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Where an edited data set goes.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -63,8 +71,18 @@ pub struct EditReport {
 /// New names of features by their old ones.
 pub type Renames = BTreeMap<String, String>;
 
-/// Told frames done and frames in all.
-type Progress<'p> = dyn FnMut(u64, u64) + 'p;
+/// Told frames done and frames in all; says whether to go on.
+type Progress<'p> = dyn FnMut(u64, u64) -> ControlFlow<()> + 'p;
+/// Told frames more.
+type Advance<'p> = dyn FnMut(u64) -> Result<()> + 'p;
+
+/// Tells how much is done of the work on `set`.
+fn tell(progress: &mut Progress<'_>, done: u64, total: u64, set: &Path) -> Result<()> {
+    match progress(done, total) {
+        ControlFlow::Continue(()) => Ok(()),
+        ControlFlow::Break(()) => Err(DatasetError::Stopped { path: set.to_path_buf() }),
+    }
+}
 
 /// A data set that episodes are taken from.
 struct Input {
@@ -88,17 +106,20 @@ impl Input {
         set.depth_names().try_for_each(|name| set.depth_size(name).map(drop))?;
         let layout = match set.provenance() {
             Some(provenance) if provenance.lossless => Some(side_folder(root, set.info())?),
-            Some(_) if set.has_pictures() => match picture_problem(&set, progress)? {
-                None => None,
-                Some(found) => {
-                    return Err(DatasetError::BadDataset {
-                        path: root.to_path_buf(),
-                        object: "images".to_owned(),
-                        expected: "the content that was recorded when it was made".to_owned(),
-                        found,
-                    });
+            Some(_) if set.has_pictures() => {
+                let tell = &mut |done, total| tell(progress, done, total, root);
+                match picture_problem(&set, false, tell)? {
+                    None => None,
+                    Some(found) => {
+                        return Err(DatasetError::BadDataset {
+                            path: root.to_path_buf(),
+                            object: "images".to_owned(),
+                            expected: "the content that was recorded when it was made".to_owned(),
+                            found,
+                        });
+                    }
                 }
-            },
+            }
             _ => None,
         };
         Ok(Self { set, layout, joins: false })
@@ -117,6 +138,8 @@ struct Edit<'a> {
     repair: Option<Repair>,
     /// Where it is written.
     root: &'a Path,
+    /// Whether the work was given up.
+    ended: AtomicBool,
 }
 
 /// The episodes of `set` that are `chosen`, as a data set of its own.
@@ -172,13 +195,14 @@ pub fn split(
     progress: &mut Progress<'_>,
 ) -> Result<Vec<(String, EditReport)>> {
     let inputs = [Input::open(set, progress)?];
+    refuse_inside(&inputs, out)?;
     let parts = parts.resolve(&inputs[0].set, seed)?;
     let staging = Staging::create(out)?;
     let total: u64 = parts.iter().map(|(_, taken)| work_of(&inputs[0].set, taken)).sum();
     let mut done = 0;
     let mut advance = |frames| {
         done += frames;
-        progress(done, total);
+        tell(progress, done, total, set)
     };
     let mut made = Vec::with_capacity(parts.len());
     for (name, taken) in parts {
@@ -188,7 +212,9 @@ pub fn split(
             operation: "create the folder",
             source,
         })?;
-        made.push((name, compose(&inputs, vec![taken], &Renames::new(), None, &root, &mut advance)?));
+        let mut report = compose(&inputs, vec![taken], &Renames::new(), None, &root, &mut advance)?;
+        report.notes.extend(left_behind(&inputs)?);
+        made.push((name, report));
     }
     staging.publish()?;
     Ok(made)
@@ -202,27 +228,20 @@ pub fn split(
 pub fn merge(sets: &[PathBuf], out: &Path, progress: &mut Progress<'_>) -> Result<EditReport> {
     let inputs = sets.iter().map(|set| Input::open(set, progress)).collect::<Result<Vec<_>>>()?;
     let taken: Vec<Vec<usize>> = inputs.iter().map(|input| (0..input.set.episodes().len()).collect()).collect();
+    refuse_inside(&inputs, out)?;
     let staging = Staging::create(out)?;
-    let report = told(&inputs, taken, &Renames::new(), None, staging.path(), progress)?;
+    let mut report = told(&inputs, taken, &Renames::new(), None, staging.path(), progress)?;
+    report.notes.extend(left_behind(&inputs)?);
     staging.publish()?;
     Ok(report)
 }
 
 /// All of `set`, which has a file an episode, in the new directory `out`.
-pub(super) fn gather(
-    set: Dataset,
-    out: &Path,
-    progress: &mut dyn FnMut(u64, u64) -> ControlFlow<()>,
-) -> Result<EditReport> {
+pub(super) fn gather(set: Dataset, out: &Path, progress: &mut Progress<'_>) -> Result<EditReport> {
     let staging = Staging::create(out)?;
-    let (root, all) = (set.root().to_path_buf(), (0..set.episodes().len()).collect());
+    let all = (0..set.episodes().len()).collect();
     let input = Input { set, layout: None, joins: true };
-    let mut stopped = false;
-    let tell = &mut |done, total| stopped |= progress(done, total).is_break();
-    let report = told(&[input], vec![all], &Renames::new(), None, staging.path(), tell)?;
-    if stopped {
-        return Err(DatasetError::Stopped { path: root });
-    }
+    let report = told(&[input], vec![all], &Renames::new(), None, staging.path(), progress)?;
     staging.publish()?;
     Ok(report)
 }
@@ -236,13 +255,56 @@ fn one(
     repair: Option<Repair>,
     progress: &mut Progress<'_>,
 ) -> Result<EditReport> {
+    let inputs = [input];
     let staging = match to {
-        Destination::New(out) => Staging::create(out)?,
-        Destination::InPlace => Staging::replacing(input.set.root())?,
+        Destination::New(out) => {
+            refuse_inside(&inputs, out)?;
+            Staging::create(out)?
+        }
+        Destination::InPlace => Staging::replacing(inputs[0].set.root())?,
     };
-    let report = told(&[input], vec![taken], renames, repair, staging.path(), progress)?;
+    let mut report = told(&inputs, vec![taken], renames, repair, staging.path(), progress)?;
+    report.notes.extend(match to {
+        Destination::New(_) => left_behind(&inputs)?,
+        Destination::InPlace => kept_beside(inputs[0].set.root())?,
+    });
     staging.publish()?;
     Ok(report)
+}
+
+/// Refuses a result inside a set that it is made of: it would be lost with the set.
+fn refuse_inside(inputs: &[Input], out: &Path) -> Result<()> {
+    let parent = out.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    // whoever creates it says what is wrong with the path
+    let Ok(parent) = std::fs::canonicalize(parent) else { return Ok(()) };
+    let inside = |input: &&Input| std::fs::canonicalize(input.set.root()).is_ok_and(|root| parent.starts_with(root));
+    match inputs.iter().find(inside) {
+        None => Ok(()),
+        Some(input) => Err(DatasetError::BadDataset {
+            path: out.to_path_buf(),
+            object: "output".to_owned(),
+            expected: format!("a place outside of {}", input.set.root().display()),
+            found: "one inside".to_owned(),
+        }),
+    }
+}
+
+/// What lies beside the sets and is not carried over.
+fn left_behind(inputs: &[Input]) -> Result<Option<String>> {
+    let mut names = BTreeSet::new();
+    for input in inputs {
+        names.extend(other_files(input.set.root())?.iter().map(|path| path.display().to_string()));
+    }
+    Ok((!names.is_empty()).then(|| format!("not copied: {}", list(names.iter().map(String::as_str)))))
+}
+
+/// The tables of other programs that stay as they are.
+fn kept_beside(set: &Path) -> Result<Option<String>> {
+    let all = other_files(set)?;
+    let tables = all.iter().filter(|path| path.starts_with("meta")).map(|path| path.display().to_string());
+    let tables: Vec<String> = tables.collect();
+    let names = || list(tables.iter().map(String::as_str));
+    Ok((!tables.is_empty()).then(|| format!("kept as it was, not adapted to the edit: {}", names())))
 }
 
 /// [`compose`], with a total.
@@ -256,10 +318,26 @@ fn told(
 ) -> Result<EditReport> {
     let total = inputs.iter().zip(&taken).map(|(input, taken)| work_of(&input.set, taken)).sum();
     let mut done = 0;
-    progress(0, total);
+    let set = inputs[0].set.root();
+    tell(progress, 0, total, set)?;
     compose(inputs, taken, renames, repair, root, &mut |frames| {
         done += frames;
-        progress(done, total);
+        tell(progress, done, total, set)
+    })
+}
+
+/// Refuses a result without a frame, which nothing reads.
+fn refuse_nothing(inputs: &[Input], taken: &[Vec<usize>]) -> Result<()> {
+    let frames = |(input, taken): (&Input, &Vec<usize>)| {
+        taken.iter().map(|&episode| input.set.episodes()[episode].length).sum::<usize>()
+    };
+    if inputs.iter().zip(taken).map(frames).sum::<usize>() > 0 {
+        return Ok(());
+    }
+    Err(DatasetError::NotInDataset {
+        path: inputs[0].set.root().to_path_buf(),
+        wanted: "frame in the episodes that were chosen".to_owned(),
+        found: "none".to_owned(),
     })
 }
 
@@ -277,12 +355,13 @@ fn compose(
     renames: &Renames,
     repair: Option<Repair>,
     root: &Path,
-    advance: &mut dyn FnMut(u64),
+    advance: &mut Advance<'_>,
 ) -> Result<EditReport> {
+    refuse_nothing(inputs, &taken)?;
     let mut notes: Vec<String> = inputs.iter().flat_map(|input| input.set.notes()).cloned().collect();
     let mut features = renamed(agree::features(inputs)?, renames);
     frames::state_index_columns(&mut features, &inputs[0].set)?;
-    let edit = Edit { inputs, taken, features, renames, repair, root };
+    let edit = Edit { inputs, taken, features, renames, repair, root, ended: AtomicBool::new(false) };
     let first = inputs[0].set.info();
     let (mut films, mut files) = (Vec::new(), Vec::new());
     for (index, (name, _)) in edit.features.0.iter().enumerate().filter(|(_, (_, f))| f.dtype == "video") {
@@ -296,6 +375,7 @@ fn compose(
     let (copied, side) = std::thread::scope(|scope| {
         let side = lossless.map(|origin| scope.spawn(|| side::copy(&edit, origin)));
         let copied = frames::copy(&edit, films, advance);
+        edit.ended.store(copied.is_err(), Ordering::Relaxed);
         (copied, side.map(|side| side.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))))
     });
     let mut copied = copied?;
@@ -311,6 +391,7 @@ fn compose(
         origin.fingerprint.clone_from(&told.fingerprint);
     }
     edit.keep_stored_totals(&mut told.stats);
+    notes.extend(edit.lost_statistics(&told.stats));
     // texts and the like have none
     let statistical: Vec<(String, bool)> = edit
         .features
@@ -319,15 +400,16 @@ fn compose(
         .filter(|(name, _)| told.stats.contains_key(name))
         .map(|(name, feature)| (name.clone(), feature.is_visual()))
         .collect();
+    let others = other_columns::columns(&edit, &mut notes)?;
     files.push(meta::write_tasks(root, &copied.tasks)?);
-    files.push(meta::write_episodes(root, &copied.tasks, &statistical, &told.rows, &told.each)?);
+    files.push(meta::write_episodes(root, &copied.tasks, &statistical, &told.rows, &told.each, &others)?);
     files.push(meta::write_stats(root, &statistical, &told.stats)?);
     let info = Info {
         total_episodes: told.rows.len(),
         total_frames: told.rows.iter().map(|row| row.length).sum(),
         total_tasks: copied.tasks.len(),
         chunks_size: info::FILES_PER_FOLDER,
-        splits: edit.splits(),
+        splits: edit.splits(&mut notes),
         data_path: info::DATA_PATH.to_owned(),
         video_path: filmed.then(|| VIDEO_PATH.to_owned()),
         features: edit.features.clone(),
@@ -362,15 +444,9 @@ impl Edit<'_> {
 
     /// Task texts that the result has whichever of them its frames do.
     fn tasks(&self) -> Vec<String> {
-        let mut tasks: Vec<String> = Vec::new();
-        for text in
-            self.inputs.iter().filter(|input| self.repair.is_some() || input.joins).flat_map(|input| input.set.tasks())
-        {
-            if !tasks.contains(text) {
-                tasks.push(text.clone());
-            }
-        }
-        tasks
+        let whole = self.inputs.iter().filter(|input| self.repair.is_some() || input.joins);
+        let mut known = BTreeSet::new();
+        whole.flat_map(|input| input.set.tasks()).filter(|text| known.insert(*text)).cloned().collect()
     }
 
     /// Whether content is hashed: of sets that LeRobot wrote, pictures are no part of the fingerprint.
@@ -398,28 +474,13 @@ impl Edit<'_> {
         }
     }
 
-    /// Named ranges of episodes: the source's, less what was dropped; of several sets one range.
-    fn splits(&self) -> BTreeMap<String, String> {
-        let total: usize = self.taken.iter().map(Vec::len).sum();
-        let mut all: Vec<&BTreeMap<String, String>> = self.inputs.iter().map(|i| &i.set.info().splits).collect();
-        all.dedup();
-        let whole = |name: &str| BTreeMap::from([(name.to_owned(), format!("0:{total}"))]);
-        match (all.as_slice(), self.inputs) {
-            ([], _) => whole("train"),
-            ([splits], [_]) => {
-                let kept = |end: usize| self.taken[0].partition_point(|&episode| episode < end);
-                let range = |(name, text): (&String, &String)| {
-                    let (from, to) = text.split_once(':')?;
-                    let (from, to) = (from.trim().parse().ok()?, to.trim().parse().ok()?);
-                    Some((name.clone(), format!("{}:{}", kept(from), kept(to))))
-                };
-                splits.iter().filter_map(range).collect()
-            }
-            (splits, _) => match splits.iter().map(|s| s.keys().collect::<Vec<_>>()).collect::<Vec<_>>().as_slice() {
-                [first, rest @ ..] if first.len() == 1 && rest.iter().all(|names| names == first) => whole(first[0]),
-                _ => whole("train"),
-            },
-        }
+    /// A note of the images and videos whose statistics an input has and the result has not.
+    fn lost_statistics(&self, stats: &BTreeMap<String, crate::stats::FeatureStats>) -> Option<String> {
+        let had = |name: &str| self.inputs.iter().any(|i| i.set.stats().contains_key(self.before(name)));
+        let lost = self.features.names().filter(|name| !stats.contains_key(*name) && had(name));
+        let names: Vec<&str> = lost.collect();
+        (!names.is_empty())
+            .then(|| format!("statistics of {} are left out: meta/episodes has none of its episodes", names.join(", ")))
     }
 }
 

@@ -6,8 +6,10 @@ use super::super::open::{ENVIRONMENT_STATE, STATE};
 use super::super::schema::{CREATED_BY, hex};
 use super::Edit;
 use crate::error::Result;
+use crate::source::file_number;
 use sha2::{Digest, Sha256};
 use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
 
 /// Seeds, as sources state them: `FIRST-LAST`.
 fn seeds_of(text: &str) -> Option<(u64, u64)> {
@@ -42,6 +44,8 @@ pub(super) fn of(edit: &Edit<'_>, notes: &mut Vec<String>) -> Result<Option<Prov
         None => return Ok(None),
     };
     let sources: BTreeSet<(&str, &str)> = all.iter().map(|p| (p.source.as_str(), p.source_sha256.as_str())).collect();
+    let mut sources: Vec<(&str, &str)> = sources.into_iter().collect();
+    sources.sort_by_key(|(name, _)| file_number(Path::new(name)));
     let (source, source_sha256) = match sources.len() {
         1 => (first.source.clone(), first.source_sha256.clone()),
         // as a folder of these files
@@ -84,7 +88,7 @@ pub(super) fn of(edit: &Edit<'_>, notes: &mut Vec<String>) -> Result<Option<Prov
         notes.push("the sets differ in seeds, which are left out: they are no ranges".to_owned());
     }
     let dialects: BTreeSet<&str> = all.iter().map(|p| p.dialect.as_str()).collect();
-    let keys = |name: &str| keys_of(first, edit.before(name));
+    let keys = |name: &str| edit.features.get(name).and_then(|_| keys_of(first, edit.before(name)));
     let entities =
         edit.features.names().filter_map(|name| Some((name.strip_prefix(ENTITY_PREFIX)?.to_owned(), keys(name)?)));
     Ok(Some(Provenance {

@@ -6,7 +6,7 @@ use super::super::meta::PROVENANCE_FILE;
 use super::super::open::Dataset;
 use super::super::tables::{Area, Tables};
 use super::super::verify::{in_full, not_finite, picture_problem};
-use super::{Destination, EditReport, Input, Progress, Renames, one};
+use super::{Destination, EditReport, Input, Progress, Renames, one, tell};
 use crate::error::Result;
 use std::path::Path;
 
@@ -72,7 +72,7 @@ fn lost(tables: &Tables, set: &Dataset, progress: &mut Progress<'_>) -> Result<O
         return Ok(Some("what is recorded of the set was changed since it was made".to_owned()));
     }
     let problem = match set.has_pictures() {
-        true => picture_problem(set, progress)?,
+        true => picture_problem(set, false, &mut |done, total| tell(progress, done, total, set.root()))?,
         false => (set.content_fingerprint() != provenance.fingerprint).then(|| "another fingerprint".to_owned()),
     };
     if let Some(problem) = problem {

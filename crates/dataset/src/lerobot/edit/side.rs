@@ -8,10 +8,11 @@ use super::super::side::{
 };
 use super::Edit;
 use super::groups::Groups;
-use crate::error::Result;
+use crate::error::{DatasetError, Result};
 use crate::tree::{Array, Demo, Dtype};
 use arrow_array::{ArrayRef, RecordBatch, new_null_array};
 use std::collections::BTreeMap;
+use std::sync::atomic::Ordering;
 
 /// Rows of the side folder that are moved at once: pictures may be among them.
 const ROWS: usize = 64;
@@ -44,6 +45,9 @@ pub(super) fn copy(edit: &Edit<'_>, origin: &Provenance) -> Result<(Vec<WrittenF
             }
         };
         for episode in input.set.episodes() {
+            if edit.ended.load(Ordering::Relaxed) {
+                return Err(DatasetError::Stopped { path: root.to_path_buf() });
+            }
             let mine = objects.of(episode.index as i64)?;
             if taken.binary_search(&episode.index).is_err() {
                 rows.as_mut().map_or(Ok(()), |rows| rows.skip(episode.length))?;
@@ -213,7 +217,7 @@ impl Rest<'_> {
 }
 
 /// Texts in the type of another array of texts, at least as wide.
-fn texts_like(like: &Array, texts: &[String]) -> Array {
+pub(in crate::lerobot) fn texts_like(like: &Array, texts: &[String]) -> Array {
     let shape = vec![texts.len()];
     match like.dtype {
         Dtype::FixedStr(width) | Dtype::FixedUtf8(width) => {

@@ -352,8 +352,17 @@ pub fn convert_shard(
     };
     if let Some(state) = there.filter(|state| state.conversion == conversion) {
         let names = state.files.keys().map(String::as_str).chain([STATE_FILE]);
-        let sizes = names.map(|name| std::fs::metadata(out.join(name)).map_or(0, |meta| meta.len()));
-        return Ok(report(&state, sizes.sum(), true));
+        let size = |name: &str| match std::fs::metadata(out.join(name)) {
+            Ok(meta) => Ok(meta.len()),
+            Err(_) => Err(DatasetError::BadDataset {
+                path: out.join(name),
+                object: format!("shard {shard}"),
+                expected: "the file that was written".to_owned(),
+                found: "no such file; remove the folder and convert this shard again".to_owned(),
+            }),
+        };
+        let bytes = names.map(size).sum::<Result<u64>>()?;
+        return Ok(report(&state, bytes, true));
     }
     let staging = Staging::create(out)?;
     let root = staging.path();

@@ -3,6 +3,7 @@
 use super::{DataFile, Derived, NUMBERS, Row, Tables, same};
 use crate::error::Result;
 use crate::lerobot::check;
+use crate::lerobot::edit::is_looked_at;
 use crate::lerobot::fingerprint::INDEX_COLUMNS;
 use crate::lerobot::info::Feature;
 use crate::lerobot::open::Dataset;
@@ -123,7 +124,7 @@ impl Tables {
         if let Err((expected, found)) = check::splits(&info.splits, self.episodes.len()) {
             faults.push(Fault::new(Area::Info, FILE, "splits", expected, found));
         }
-        for (column, file) in &self.strangers {
+        for (column, file) in &self.unstated {
             // LeRobot refuses to open such a set
             let fault = Fault::new(Area::Info, FILE, "features", format!("{column}, a column of {file}"), "none");
             faults.push(Fault { repairable: false, ..fault });
@@ -359,13 +360,15 @@ impl Tables {
         if set.stats().is_empty() {
             faults.push(Fault::new(Area::Statistics, FILE, "file", "statistics of every feature", "none"));
         }
+        let wide = set.wide()?;
         let columns: Vec<String> = set.column_names().map(str::to_owned).collect();
         let finite: BTreeMap<&String, Vec<bool>> = columns.iter().map(|name| (name, finite(set, name))).collect();
-        for (name, computed) in set.statistics_of(&all)?.into_iter().filter(|_| !set.stats().is_empty()) {
+        let tolerance = |name: &String| if wide.contains_key(name) { WIDE_TOLERANCE } else { TOLERANCE };
+        for (name, computed) in set.exact_statistics_of(&all)?.into_iter().filter(|_| !set.stats().is_empty()) {
             match set.stats().get(&name) {
                 None => faults.push(Fault::new(Area::Statistics, FILE, &name, "statistics", "none")),
                 Some(stored) => {
-                    let found = differing(&computed, stored, &finite[&name], TOLERANCE);
+                    let found = differing(&computed, stored, &finite[&name], tolerance(&name));
                     faults.extend(found.map(|(what, expected, found)| {
                         Fault::new(Area::Statistics, FILE, &format!("{name}: {what}"), expected, found)
                     }));
@@ -378,12 +381,13 @@ impl Tables {
             else {
                 continue;
             };
-            let found = differing(&computed, stored, &[true], INDEX_TOLERANCE);
+            let found = differing(&computed, stored, &[true], TOLERANCE);
             faults.extend(found.map(|(what, expected, found)| {
                 Fault::new(Area::Statistics, FILE, &format!("{name}: {what}"), expected, found)
             }));
         }
-        for (name, _) in self.info.features.0.iter().filter(|(_, f)| !f.is_visual() && !f.is_text()) {
+        self.picture_statistics_faults(set, &mut faults);
+        for (name, feature) in self.info.features.0.iter().filter(|(_, f)| !f.is_visual() && !f.is_text()) {
             let mut stored: Vec<FeatureStats> = Vec::new();
             for path in read::files(&self.root, "meta/episodes")? {
                 stored.extend(crate::lerobot::edit::statistics_in(&path, name)?);
@@ -393,6 +397,9 @@ impl Tables {
                 let Some((at, stored)) = episode.row.and_then(|at| Some((at, stored.get(at)?))) else { continue };
                 let computed = match index {
                     true => self.expected(name, number).and_then(|values| values.stats(1)),
+                    false if wide.contains_key(name) => {
+                        wide[name].stats(&[(episode.first, episode.first + episode.length)], feature.dim())
+                    }
                     false => set.column(name).and_then(|column| {
                         let range = episode.first * column.dim..(episode.first + episode.length) * column.dim;
                         FeatureStats::of(column.data.get(range)?, column.dim)
@@ -400,7 +407,7 @@ impl Tables {
                 };
                 let Some(computed) = computed else { continue };
                 let usable = if index { vec![true] } else { finite.get(name).cloned().unwrap_or_default() };
-                let tolerance = if index { INDEX_TOLERANCE } else { TOLERANCE };
+                let tolerance = tolerance(name);
                 let row = &self.rows[at];
                 faults.extend(differing(&computed, stored, &usable, tolerance).map(|(what, expected, found)| {
                     let what = format!("stats/{name}/{what}");
@@ -409,6 +416,24 @@ impl Tables {
             }
         }
         Ok(faults)
+    }
+
+    /// Of pictures, what can be said of statistics without looking at them. LeRobot trains on no camera without any.
+    fn picture_statistics_faults(&self, set: &Dataset, faults: &mut Vec<Fault>) {
+        const FILE: &str = "meta/stats.json";
+        for (name, feature) in self.info.features.0.iter().filter(|(_, f)| f.is_visual() && !set.stats().is_empty()) {
+            match set.stats().get(name) {
+                None if feature.is_depth() => {}
+                None => {
+                    let fault = Fault::new(Area::Statistics, FILE, name, "statistics", "none");
+                    faults.push(Fault { repairable: is_looked_at(feature), ..fault });
+                }
+                Some(stored) => faults.extend(in_disorder(stored, &[], TOLERANCE).map(|(what, expected, found)| {
+                    let fault = Fault::new(Area::Statistics, FILE, &format!("{name}: {what}"), expected, found);
+                    Fault { repairable: is_looked_at(feature), ..fault }
+                })),
+            }
+        }
     }
 
     /// The values of an index column in an episode.
@@ -428,30 +453,67 @@ impl Tables {
     }
 }
 
-/// Relative difference up to which a stored statistic counts as right: LeRobot computes some in f32.
-const TOLERANCE: f64 = 1e-5;
-/// The same of columns that number frames, whose statistics it puts together from those of episodes.
-const INDEX_TOLERANCE: f64 = 1e-4;
+/// Difference up to which a stored statistic counts as right, as a share of the largest value: LeRobot adds in float32.
+const TOLERANCE: f64 = 1e-4;
+/// The same of numbers that float32 does not hold, which it adds in float64.
+const WIDE_TOLERANCE: f64 = 1e-10;
 
-/// The first statistic that differs, with both values, in the dimensions that are `usable`.
-fn differing(
-    computed: &FeatureStats,
-    stored: &FeatureStats,
-    usable: &[bool],
-    tolerance: f64,
-) -> Option<(&'static str, String, String)> {
+/// A statistic, what belongs there and what was found.
+type Found = (&'static str, String, String);
+
+type Get = fn(&FeatureStats) -> &Vec<f64>;
+
+/// The first statistic that differs, in the dimensions that are `usable`.
+fn differing(computed: &FeatureStats, stored: &FeatureStats, usable: &[bool], tolerance: f64) -> Option<Found> {
     if stored.count != computed.count {
         return Some(("count", computed.count.to_string(), stored.count.to_string()));
     }
-    type Get = fn(&FeatureStats) -> &Vec<f64>;
     let vectors: [(&str, Get); 4] =
         [("min", |s| &s.min), ("max", |s| &s.max), ("mean", |s| &s.mean), ("std", |s| &s.std)];
     for (statistic, get) in vectors {
         let (a, b) = (get(computed), get(stored));
-        let close = |x: f64, y: f64| (x - y).abs() <= tolerance * x.abs().max(1.0);
-        let same = |i: usize| usable.get(i) == Some(&false) || close(a[i], b[i]);
+        let close = |i: usize| {
+            let scale = scale(computed, i);
+            // a variance is a difference of squares
+            (a[i] - b[i]).abs() <= tolerance * scale
+                || statistic == "std" && (a[i].powi(2) - b[i].powi(2)).abs() <= tolerance * scale.powi(2)
+        };
+        let same = |i: usize| usable.get(i) == Some(&false) || close(i);
         if a.len() != b.len() || !(0..a.len()).all(same) {
             return Some((statistic, format!("{a:?}"), format!("{b:?}")));
+        }
+    }
+    in_disorder(stored, usable, tolerance)
+}
+
+/// The largest value of a dimension.
+fn scale(stats: &FeatureStats, dimension: usize) -> f64 {
+    let size = |vector: &Vec<f64>| vector.get(dimension).map_or(0.0, |value| value.abs());
+    size(&stats.min).max(size(&stats.max))
+}
+
+/// The first of the quantiles that is less than the one before it, or of another length. Old sets have none.
+fn in_disorder(stored: &FeatureStats, usable: &[bool], tolerance: f64) -> Option<Found> {
+    let vectors: [(&str, Get); 7] = [
+        ("min", |s| &s.min),
+        ("q01", |s| &s.q01),
+        ("q10", |s| &s.q10),
+        ("q50", |s| &s.q50),
+        ("q90", |s| &s.q90),
+        ("q99", |s| &s.q99),
+        ("max", |s| &s.max),
+    ];
+    let dim = stored.min.len();
+    let there: Vec<_> = vectors.iter().map(|(name, get)| (*name, get(stored))).filter(|(_, v)| !v.is_empty()).collect();
+    for two in there.windows(2) {
+        let [(_, low), (name, high)] = two else { continue };
+        if high.len() != dim || low.len() != dim {
+            return Some((name, format!("{dim} numbers"), format!("{high:?}")));
+        }
+        // LeRobot counts quantiles in bins a little wider than the values
+        let rises = |i: usize| high[i] >= low[i] - tolerance.max(TOLERANCE) * scale(stored, i) - 1e-9;
+        if !(0..dim).all(|i| usable.get(i) == Some(&false) || rises(i)) {
+            return Some((name, format!("no less than {low:?}"), format!("{high:?}")));
         }
     }
     None

@@ -1,7 +1,7 @@
 //! LeRobot v2.0 and v2.1 folders.
 
 use super::{fixture, quiet};
-use crate::common::copy;
+use crate::common::{copy, going};
 use arrow_array::cast::AsArray;
 use arrow_array::types::{Float32Type, Int64Type};
 use arrow_array::{Array, ArrayRef, FixedSizeListArray, Float32Array, RecordBatch};
@@ -116,6 +116,7 @@ fn a_count_that_is_wrong_is_noted_and_other_doors_say_what_to_do() {
     copy(&fixture("lerobot_v21"), &old);
     let path = old.join("meta/episodes.jsonl");
     let lines = std::fs::read_to_string(&path).unwrap().replace("\"length\": 4", "\"length\": 9");
+    let lines = lines.replacen("\"length\"", "\"operator\": \"Ada\", \"scores\": [1, null], \"length\"", 1);
     std::fs::write(&path, lines).unwrap();
     let info = std::fs::read_to_string(old.join("meta/info.json")).unwrap();
     std::fs::write(old.join("meta/info.json"), info.replace("\"total_episodes\": 3", "\"total_episodes\": 4")).unwrap();
@@ -127,8 +128,18 @@ fn a_count_that_is_wrong_is_noted_and_other_doors_say_what_to_do() {
     assert!(length.contains("episode 1: expected 4 frames"), "{length}");
     assert!(files.contains("1 files, which are left out: data/chunk-000/episode_000003.parquet"), "{files}");
     assert_eq!(opened.set().frames(), 15);
+    drop(opened);
+    // what another program says of an episode is kept
+    let made = dir.path().join("made");
+    convert(&old, &made, &ConvertOptions::default(), &mut quiet).unwrap();
+    let file = File::open(made.join("meta/episodes/chunk-000/file-000.parquet")).unwrap();
+    let table = ParquetRecordBatchReaderBuilder::try_new(file).unwrap().build().unwrap().next().unwrap().unwrap();
+    let operators = table.column_by_name("operator").unwrap().as_string::<i32>();
+    assert_eq!(operators.iter().collect::<Vec<_>>(), [Some("Ada"), None, None]);
+    let scores = table.column_by_name("scores").unwrap().as_list::<i32>();
+    assert_eq!((scores.null_count(), scores.value(0).as_primitive::<Int64Type>().value(0)), (2, 1));
     let chosen = Selection { episodes: vec![0], ..Selection::default() };
-    let kept = keep(&old, &Destination::New(dir.path().join("kept")), &chosen, &mut quiet).map(drop);
+    let kept = keep(&old, &Destination::New(dir.path().join("kept")), &chosen, &mut going).map(drop);
     let opened = Dataset::open(&old).map(drop);
     for text in [kept, opened, Source::open(&old).map(drop)].map(|r| r.unwrap_err().to_string()) {
         assert!(text.contains("`actrm-data convert` makes a") && !text.contains('\n'), "{text}");

@@ -1,0 +1,75 @@
+//! What lies in the folder of a data set and is no part of it: a README, a `.git`, tables of other programs.
+
+use crate::error::{DatasetError, Result};
+use std::fs::File;
+use std::io;
+use std::os::unix::fs::symlink;
+use std::path::{Path, PathBuf};
+
+/// Their paths in the folder, sorted; of a folder that holds no part of the set its own alone.
+pub(super) fn other_files(root: &Path) -> Result<Vec<PathBuf>> {
+    let mut found = Vec::new();
+    look(root, Path::new(""), &mut found)?;
+    found.sort();
+    Ok(found)
+}
+
+fn look(root: &Path, below: &Path, found: &mut Vec<PathBuf>) -> Result<()> {
+    let folder = root.join(below);
+    let failed = |source| DatasetError::Io { path: folder.clone(), operation: "list it", source };
+    for entry in std::fs::read_dir(&folder).map_err(failed)? {
+        let entry = entry.map_err(failed)?;
+        let path = below.join(entry.file_name());
+        let ends = |extension: &str| path.extension().is_some_and(|own| own == extension);
+        let names: Vec<_> = path.iter().filter_map(|name| name.to_str()).collect();
+        let (looked_into, part) = match names.as_slice() {
+            ["actrm" | "images"] => (false, true),
+            ["meta" | "data" | "videos"] => (true, true),
+            ["meta", "info.json" | "stats.json" | "tasks.parquet"] => (false, true),
+            ["meta", "episodes", ..] | ["data", ..] => (true, ends("parquet")),
+            ["videos", ..] => (true, ends("mp4")),
+            _ => (false, false),
+        };
+        if looked_into && entry.file_type().map_err(failed)?.is_dir() {
+            look(root, &path, found)?;
+        } else if !part {
+            found.push(path);
+        }
+    }
+    Ok(())
+}
+
+/// Puts them into another folder too, as links to the same files where the file system has such links, and on the disk.
+pub(super) fn carry_over(from: &Path, to: &Path) -> Result<()> {
+    for path in other_files(from)? {
+        super::shards::create_parent(&to.join(&path))?;
+        let kept = || {
+            carry(&from.join(&path), &to.join(&path))?;
+            path.ancestors().skip(1).try_for_each(|folder| sync(&to.join(folder)))
+        };
+        kept().map_err(|source| DatasetError::Io { path: from.join(&path), operation: "keep it", source })?;
+    }
+    Ok(())
+}
+
+fn sync(path: &Path) -> io::Result<()> {
+    File::open(path)?.sync_all()
+}
+
+fn carry(from: &Path, to: &Path) -> io::Result<()> {
+    let kind = std::fs::symlink_metadata(from)?;
+    if kind.is_dir() {
+        std::fs::create_dir(to)?;
+        for entry in std::fs::read_dir(from)? {
+            let entry = entry?;
+            carry(&entry.path(), &to.join(entry.file_name()))?;
+        }
+        sync(to)?;
+        return std::fs::set_permissions(to, kind.permissions());
+    }
+    match std::fs::hard_link(from, to) {
+        Err(_) if kind.is_symlink() => symlink(std::fs::read_link(from)?, to),
+        Err(_) if kind.is_file() => std::fs::copy(from, to).and_then(|_| sync(to)),
+        linked => linked,
+    }
+}
