@@ -187,5 +187,6 @@ fn a_converted_data_set_is_valid_and_exports_its_source() {
     succeeds(&mut data(["validate", text(&set)]));
     succeeds(&mut data(["export", text(&set), text(&again)]));
     succeeds(&mut data(["validate", text(&again)]));
+    refused(&mut data(["validate", text(&again), "--tolerance", "1"]), &["--tolerance belongs to a data set"]);
     assert_eq!(listing(folder.path()), ["again.hdf5", "lift"]);
 }

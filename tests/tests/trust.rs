@@ -45,7 +45,7 @@ fn an_entry_says_where_it_comes_from_and_answers_as_when_it_was_sealed() {
         let said = succeeds(&mut zoo(["verify", "lift-act", more, "--zoo", text(&entries)]));
         String::from_utf8(said.stdout).expect("text")
     };
-    assert!(verify("--deep").contains("it gives the stored actions again, bit for bit"), "{}", verify("--deep"));
+    assert!(verify("--deep").contains("it predicts the stored actions bit for bit"), "{}", verify("--deep"));
     let entry = fs::read_to_string(entries.join("lift-act/1/entry.json")).expect("text");
     let entry: serde_json::Value = serde_json::from_str(&entry).expect("JSON");
     assert_eq!(entry["license"], "apache-2.0");

@@ -87,7 +87,7 @@ fn from_cameras_to_the_leaderboard() {
     let plain = eval("lift-act-image@1", &entries, &["--episodes", "2", "--video-failed", "1"]);
     let text_of = |mut command: Command| said(&mut command);
     let shown = text_of(plain);
-    assert!(shown.contains("lift-act-image@1 on Lift: 0 of 2"), "{shown}");
+    assert!(shown.contains("lift-act-image@1 on Lift, seeds 10000-10001: 0 of 2"), "{shown}");
     let videos = listing(&entries.join("videos/lift-act-image@1"));
     assert!(videos.len() == 1 && videos[0].starts_with("Lift-10000-failure-seen-"), "{videos:?}");
     // every outcome again, whatever drew the pictures
@@ -324,7 +324,7 @@ fn pictures_are_seen_in_the_colours_of_three_entities() {
     // evaluated in them, and again with the same outcomes
     let entries = at("painted/zoo");
     let shown = said(&mut eval("lift-act-image@1", &entries, &["--episodes", "1"]));
-    assert!(shown.contains("lift-act-image@1 on Lift: 0 of 1"), "{shown}");
+    assert!(shown.contains("lift-act-image@1 on Lift, seeds 10000: 0 of 1"), "{shown}");
     let again = said(&mut eval("lift-act-image@1", &entries, &["--episodes", "1", "--again"]));
     assert!(again.contains("1 episodes run again, every outcome the same"), "{again}");
     let mut wide = painted.clone();

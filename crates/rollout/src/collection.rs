@@ -51,6 +51,12 @@ pub struct CollectionRecord {
     /// SHA-256 by package of the sources that were imported to simulate.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub sources: BTreeMap<String, String>,
+    /// Which kernels numpy's linear algebra ran, where the workers tell.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub kernels: Option<String>,
+    /// What draws the cameras' images.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub renderer: Option<String>,
 }
 
 impl CollectionRecord {
@@ -67,7 +73,18 @@ impl CollectionRecord {
             env_args: ready.env_args.clone(),
             versions: ready.versions.clone(),
             sources: ready.sources.clone(),
+            kernels: ready.kernels.clone(),
+            renderer: ready.renderer.clone(),
         }
+    }
+
+    /// Whether the attempts of a stored record are ours. An older one says nothing of kernels and renderer.
+    fn is_of(&self, stored: &[u8]) -> bool {
+        serde_json::from_slice(stored).is_ok_and(|stored: Self| {
+            let kernels = stored.kernels.clone().or_else(|| self.kernels.clone());
+            let renderer = stored.renderer.clone().or_else(|| self.renderer.clone());
+            Self { kernels, renderer, ..stored } == *self
+        })
     }
 }
 
@@ -117,7 +134,7 @@ impl Collection {
         let (first_seed, expert, skill) = (record.first_seed, record.expert.clone(), record.skill);
         let collection = Self { folder: folder.to_owned(), first_seed, expert, skill, _lock: lock };
         match fs::read(&path) {
-            Ok(found) if found == text => {}
+            Ok(found) if record.is_of(&found) => {}
             // one that came to no attempt is in nobody's way
             Ok(found) if collection.count()? > 0 => return Err(differs(folder, &found, record)),
             Ok(_) => write_atomic(&path, &text)?,
@@ -217,7 +234,10 @@ fn differs(folder: &Path, stored: &[u8], record: &CollectionRecord) -> RolloutEr
         // the usual one is left out of records, but not of what is said about them
         fields.entry("skill").or_insert_with(|| Skill::Good.as_str().into());
     }
-    let fields = now.as_object().into_iter().flatten();
+    // an older record does not have these, which is no difference
+    let telling = |name: &&str| stored.get(*name).is_some();
+    let untold: Vec<&str> = ["kernels", "renderer"].into_iter().filter(|name| !telling(name)).collect();
+    let fields = now.as_object().into_iter().flatten().filter(|(name, _)| !untold.contains(&name.as_str()));
     let text = |value: Option<&serde_json::Value>| value.map_or_else(|| "nothing".to_owned(), ToString::to_string);
     let found = fields.map(|(name, value)| (name, value, stored.get(name))).find(|(_, now, was)| *was != Some(*now));
     let (what, expected, found) = match found {
@@ -245,6 +265,8 @@ mod tests {
             env_args: serde_json::json!({"env_name": "Lift", "env_kwargs": {"camera_names": ["agentview"]}}),
             versions: [("mujoco".to_owned(), "3.3.7".to_owned())].into(),
             sources: [("robosuite".to_owned(), "a".repeat(64))].into(),
+            kernels: Some("openblas Haswell".into()),
+            renderer: None,
         }
     }
 
@@ -296,6 +318,13 @@ mod tests {
         let shadow = CollectionRecord { sources: [("robosuite".to_owned(), "b".repeat(64))].into(), ..record() };
         let error = Collection::open(dir.path(), &shadow).unwrap_err().to_string();
         assert!(error.contains("sources: expected {\"robosuite\":\"bbbb"), "{error}");
+        let kernels = CollectionRecord { kernels: Some("openblas SkylakeX".into()), ..record() };
+        let error = Collection::open(dir.path(), &kernels).unwrap_err().to_string();
+        assert!(error.contains("kernels: expected \"openblas SkylakeX\", found \"openblas Haswell\""), "{error}");
+        // of an older program, which did not tell
+        let older = CollectionRecord { kernels: None, ..record() };
+        fs::write(dir.path().join(RECORD), serde_json::to_vec(&older).unwrap()).unwrap();
+        assert_eq!(Collection::open(dir.path(), &kernels).unwrap().count().unwrap(), 1);
     }
 
     #[test]

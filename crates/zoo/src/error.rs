@@ -1,6 +1,6 @@
 //! Everything that can go wrong in this crate, one variant an operation and its object.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// Writes names the way every message lists them: `a, b, c`, or `none`.
 pub(crate) fn list(names: &[String]) -> String {
@@ -15,6 +15,20 @@ fn hint(nearest: &Option<String>) -> String {
 /// ` (did you mean `x`, `y`?)`, or nothing.
 fn hints(nearest: &[String]) -> String {
     if nearest.is_empty() { String::new() } else { format!(" (did you mean `{}`?)", nearest.join("`, `")) }
+}
+
+/// The entry that is not there, and those that are as far as they fit a line.
+fn unknown_entry(name: &str, zoo: &Path, nearest: &Option<String>, available: &[String]) -> String {
+    const FEW: usize = 8;
+    let place = zoo.display();
+    if !zoo.is_dir() {
+        return format!("unknown entry `{name}`: there is no zoo {place}; name yours with --zoo DIR or ACTRM_ZOO_DIR");
+    }
+    let known = match available.len() {
+        0..=FEW => format!("entries: {}", list(available)),
+        many => format!("`actrm-zoo list` shows all {many}"),
+    };
+    format!("unknown entry `{name}` in zoo {place}{}; {known}", hint(nearest))
 }
 
 /// An operation of this crate that failed.
@@ -158,6 +172,15 @@ pub enum ZooError {
         source: models::ModelError,
     },
 
+    /// Something that cannot be done with what was named.
+    #[error("{what}: {reason}")]
+    NotPossible {
+        /// The entry or the run.
+        what: String,
+        /// Why, and what can be done.
+        reason: String,
+    },
+
     // ---- training runs -----------------------------------------------------------------------
     /// Another process trains in this folder.
     #[error("run folder {} is in use by another training (lock file {})", folder.display(), folder.join("lock").display())]
@@ -214,7 +237,7 @@ pub enum ZooError {
 
     // ---- entries -----------------------------------------------------------------------------
     /// No entry of that name in the zoo.
-    #[error("unknown entry `{name}` in zoo {}{}; entries: {}", zoo.display(), hint(nearest), list(available))]
+    #[error("{}", unknown_entry(name, zoo, nearest, available))]
     UnknownEntry {
         /// The entry asked for, `name` or `name@version`.
         name: String,
@@ -327,7 +350,7 @@ pub enum ZooError {
     },
     /// Demonstrations that the entry was trained on began as the evaluation's episodes would.
     #[error(
-        "entry {entry}: the seeds {seeds} were asked for, and its demonstrations used {demonstrations}: it has seen these episodes; --force evaluates all the same, and the row then says so"
+        "entry {entry}: the seeds {seeds} were asked for, and its training demonstrations began with {demonstrations}; use --force to evaluate anyway, and the row says so"
     )]
     DemonstrationSeeds {
         /// The entry.

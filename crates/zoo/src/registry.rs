@@ -369,7 +369,10 @@ mod tests {
         }
         assert_eq!(Registry::open(zoo.path()).locate("a").unwrap().id().to_string(), "a@2");
         let message = other.locate(&place("c")).unwrap_err().to_string();
-        assert!(message.starts_with("unknown entry `c` in zoo ") && message.contains("a@1, a@2, b@1"), "{message}");
+        assert!(
+            message.starts_with("unknown entry `c` in zoo ") && message.contains("entries: a@1, a@2, b@1"),
+            "{message}"
+        );
         let message = other.locate("/").unwrap_err().to_string();
         assert!(message.starts_with("entry name ``"), "{message}");
     }

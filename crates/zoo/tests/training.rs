@@ -599,13 +599,14 @@ fn a_finished_run_goes_on_to_the_bytes_of_a_longer_one() {
     let data = demonstrations(root.path());
     let whole = finish(&request(root.path(), &data, &["train.schedule=constant"]));
     let short = request(root.path(), &data, &["train.schedule=constant", "train.steps=5"]);
-    let run = root.path().join("runs/act_lift/002");
+    let runs = root.path().join("runs");
+    let run = runs.join("act_lift/002");
     let first = finish(&short);
     for (steps, words) in [(5, "`train.steps`: expected more than the 5 of the finished run"), (0, "found 0")] {
-        let error = extend(&run, steps).err().unwrap().to_string();
+        let error = extend(&run, &runs, steps).err().unwrap().to_string();
         assert!(error.contains(words), "{error}");
     }
-    let extended = extend(&run, 12).unwrap();
+    let extended = extend(&run, &runs, 12).unwrap();
     assert!(extended.folder.ends_with("act_lift/003"));
     let request = TrainRequest {
         name: extended.name,
@@ -621,9 +622,9 @@ fn a_finished_run_goes_on_to_the_bytes_of_a_longer_one() {
     assert_eq!(longer.meta().training.as_ref().unwrap().steps, 12);
     // rates that depend on the number of steps
     finish(&TrainRequest { resume: false, ..request_of_cosine(root.path(), &data) });
-    let error = extend(&root.path().join("runs/act_lift/004"), 50).err().unwrap().to_string();
-    assert!(error.contains("`train.schedule`: expected constant") && error.contains("--from lift-act@4"), "{error}");
-    let error = extend(&root.path().join("runs"), 50).err().unwrap().to_string();
+    let error = extend(&runs.join("act_lift/004"), &runs, 50).err().unwrap().to_string();
+    assert!(error.contains("its cosine schedule") && error.contains("--from lift-act@4"), "{error}");
+    let error = extend(&runs, &runs, 50).err().unwrap().to_string();
     assert!(error.contains("not finished"), "{error}");
 }
 

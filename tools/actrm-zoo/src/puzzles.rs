@@ -70,22 +70,27 @@ pub fn family(name: &str) -> anyhow::Result<Task> {
     }
 }
 
+/// What is asked for.
+pub struct Asked<'a> {
+    /// An option that a solver does not take.
+    pub of_robots: Option<&'a str>,
+    pub task: Option<&'a str>,
+    pub args: &'a PuzzleArgs,
+    /// Another seed than that of the puzzles that every solver answers.
+    pub seed: Option<u64>,
+    pub again: bool,
+    /// Of an entry that was not named (`--all`), options count as far as it takes them.
+    pub named: bool,
+}
+
 /// Evaluates a solver, or `again` compares with what is stored; the line to show and the same as data, `None` of an entry that is
-/// no solver. `of_robots` is an option that a solver does not take. `seed` is another than that of the puzzles that every
-/// solver answers.
-pub fn evaluate(
-    entry: &Entry,
-    of_robots: Option<&str>,
-    task: Option<&str>,
-    args: &PuzzleArgs,
-    seed: Option<u64>,
-    again: bool,
-    results: &Path,
-) -> anyhow::Result<Option<(String, Value)>> {
+/// no solver.
+pub fn evaluate(entry: &Entry, asked: &Asked<'_>, results: &Path) -> anyhow::Result<Option<(String, Value)>> {
     if !is_solver(entry) {
         return Ok(None);
     }
-    if let Some(option) = of_robots {
+    let args = asked.args;
+    if let Some(option) = asked.of_robots {
         bail!(
             "{option}: expected a robot policy, found a solver of puzzles, which takes --puzzles, --depth, --givens, --seed-start and --again"
         );
@@ -93,19 +98,22 @@ pub fn evaluate(
     if !(args.noise.is_finite() && args.noise >= 0.0) {
         bail!("--noise: expected a number from 0, found {}", args.noise);
     }
-    let task = task.map(family).transpose()?;
+    let task = asked.task.map(family).transpose()?;
     let solver = SolverEntry::load(entry, task)?;
-    let options = PuzzleEvaluationOptions {
+    let mut options = PuzzleEvaluationOptions {
         task,
         givens: args.givens,
         puzzles: args.puzzles,
         depth: usize::try_from(args.depth)?,
-        seed: seed.unwrap_or(TEST_SEED),
+        seed: asked.seed.unwrap_or(TEST_SEED),
         starts: if args.starts == 1 { Starts::ONE } else { Starts { most: args.starts, noise: args.noise } },
         views: args.views,
         judge: args.judge.into(),
     };
-    if again {
+    if !asked.named {
+        options = options.fitting(&solver)?;
+    }
+    if asked.again {
         let puzzles = evaluate_puzzles_again(&solver, results, &options)?.record.answers.puzzles;
         let line = format!("{}: {puzzles} puzzles answered again, every answer the same", entry.id());
         return Ok(Some((line, json!({"entry": entry.id().to_string(), "run_again": puzzles, "different": 0}))));
@@ -167,7 +175,7 @@ pub fn trace(entry: &Entry, options: &TraceOptions<'_>, of_robots: Option<&str>)
     let trace = study::puzzle::trace(&solver, task, givens, options.index.unwrap_or(0), depth)?;
     match options.svg {
         Some(path) => {
-            cli::make_parent(path)?;
+            let _parents = cli::make_parent(path)?;
             write_atomic(path, trace.to_svg().as_bytes())?;
             cli::print(&(shown(path) + "\n"))?;
         }

@@ -30,11 +30,8 @@ pub fn export(entry: &Entry, out: &Path) -> Result<(), ZooError> {
         modes: experiment.normalisation.modes(&meta.signature),
     };
     let Some(config) = checkpoint.write() else {
-        return Err(ZooError::InvalidValue {
-            key: format!("policy.type of {}", entry.id()),
-            expected: "act or diffusion: LeRobot has no other policy of ours".to_owned(),
-            found: experiment.policy_type(),
-        });
+        let reason = format!("LeRobot export takes ACT and diffusion, found {}", experiment.policy_type());
+        return Err(ZooError::NotPossible { what: format!("entry {}", entry.id()), reason });
     };
     let model_error = || experiment.model_error("export");
     let config = config.map_err(model_error())?;

@@ -21,8 +21,8 @@ use zoo::{ZooError, write_atomic};
 /// there or cannot be written.
 pub fn export(entry: &LoadedEntry, out: &Path) -> Result<(), ZooError> {
     if out.exists() {
-        let source = std::io::Error::from(std::io::ErrorKind::AlreadyExists);
-        return Err(ZooError::Io { operation: "create", path: out.to_owned(), source });
+        let reason = "it exists already; choose another path or remove it first".to_owned();
+        return Err(ZooError::NotPossible { what: out.display().to_string(), reason });
     }
     Ok(write_atomic(out, &model(entry)?)?)
 }
@@ -30,14 +30,15 @@ pub fn export(entry: &LoadedEntry, out: &Path) -> Result<(), ZooError> {
 fn model(entry: &LoadedEntry) -> Result<Vec<u8>, ZooError> {
     let (id, experiment) = (entry.entry().id(), entry.experiment());
     let signature = entry.preprocess().signature();
-    let refuse = |expected: &str, found: String| {
-        Err(ZooError::InvalidValue { key: format!("entry {id}"), expected: expected.to_owned(), found })
+    let refuse = |found: String| {
+        let reason = format!("ONNX export takes ACT and BC of one observation without images, found {found}");
+        Err(ZooError::NotPossible { what: format!("entry {id}"), reason })
     };
     if signature.n_obs_steps != 1 {
-        return refuse("a policy of one observation for ONNX", format!("one of {}", signature.n_obs_steps));
+        return refuse(format!("{} observations", signature.n_obs_steps));
     }
     if let Some(image) = signature.of_kind(FeatureKind::Image).next() {
-        return refuse("a policy without images for ONNX", image.name.clone());
+        return refuse(image.name.clone());
     }
     let failed = |source| entry.failed("export", source);
     let numbers = |tensors: BTreeMap<String, Tensor>| -> Result<BTreeMap<String, Numbers>, ZooError> {
@@ -56,15 +57,12 @@ fn model(entry: &LoadedEntry) -> Result<Vec<u8>, ZooError> {
     let predicted = match &experiment.policy {
         PolicyConfig::Act(config) => {
             if config.pointer.is_some() || config.pre_norm || config.feedforward_activation != Activation::Relu {
-                return refuse(
-                    "ACT as LeRobot trains it for ONNX",
-                    "pointer, pre_norm or another activation".to_owned(),
-                );
+                return refuse("ACT with a pointer, pre_norm or another activation than ReLU".to_owned());
             }
             network.act(config, signature)
         }
         PolicyConfig::Bc(config) => network.bc(config, signature),
-        other => return refuse("act or bc for ONNX", other.policy_type().to_owned()),
+        other => return refuse(other.policy_type().to_owned()),
     };
     network.unnormalised(&predicted, models::ACTION, "action");
     let horizon = experiment.policy.action_horizon();

@@ -35,7 +35,7 @@ pub const COLUMNS: &[Column<LeaderboardRow>] = &[
     count(|row: &LeaderboardRow| Some(row.standing.as_ref()?.ranks.0 as u64)).csv("rank_first"),
     count(|row: &LeaderboardRow| Some(row.standing.as_ref()?.ranks.1 as u64)).csv("rank_last"),
     text(ranks_text).table("ranks").page("ranks").more(),
-    text(letters).csv("letters").table("group").page("group"),
+    text(letters).csv("letters").table("letters").page("letters"),
     text(|row: &LeaderboardRow| row.progress_text(0)).table("progress"),
     text(|row: &LeaderboardRow| row.progress_text(1)).page("progress").more(),
     number(LeaderboardRow::mean_return, 4, 2).csv("mean_return").table("return").page("return").more(),

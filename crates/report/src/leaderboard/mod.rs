@@ -173,7 +173,7 @@ mod tests {
         let progress = row.progress.unwrap();
         assert!((progress.value - 0.9).abs() < 1e-12 && progress.low < 0.9 && progress.high > 0.9, "{progress:?}");
         assert!(cells(COLUMNS, [&row]).rows[0].iter().any(|cell| cell.starts_with("90% [")));
-        assert!(row.summary().contains(", 90.0% of the way on average"), "{}", row.summary());
+        assert!(row.summary().contains(", mean progress 90.0%"), "{}", row.summary());
         let mut further = evaluation.clone();
         for (k, episode) in further.episodes.iter_mut().enumerate() {
             episode.progress = Some(if episode.success || k % 2 == 0 { 1.0 } else { 0.75 });

@@ -516,7 +516,7 @@ impl LeaderboardRow {
         format!("{} steps{between}{:.1} min", self.record().training.steps, self.minutes())
     }
 
-    /// `lift-act@1 on Lift: 20 of 20 (100.0%, 95% interval 83.9-100.0), mean 44.7 steps to success`, and a line for each
+    /// `lift-act@1 on Lift, seeds 10000-10019: 20 of 20 (100.0%, 95% interval 83.9-100.0), mean 44.7 steps to success`, and a line for each
     /// group of episodes; `wrong in 3` where the environment ended episodes with that word.
     pub fn summary(&self) -> String {
         let rate = |counts: &Counts| {
@@ -524,12 +524,18 @@ impl LeaderboardRow {
             format!("{} of {} ({rate}, 95% interval {interval})", counts.successes, counts.episodes)
         };
         let changed = self.record().protocol.perturbation.as_ref().map(|word| format!(", {word}")).unwrap_or_default();
-        let mut text = format!("{} on {}{changed}: {}", self.record().entry, self.task(), rate(&self.counts));
+        let mut text = format!(
+            "{} on {}{changed}, seeds {}: {}",
+            self.record().entry,
+            self.task(),
+            self.record().seeds,
+            rate(&self.counts)
+        );
         if let Some(steps) = self.mean_steps_to_success() {
             text.push_str(&format!(", mean {steps:.1} steps to success"));
         }
         if let Some(progress) = self.progress.filter(|progress| progress.value < 1.0) {
-            text.push_str(&format!(", {:.1}% of the way on average", progress.value * 1e2));
+            text.push_str(&format!(", mean progress {:.1}%", progress.value * 1e2));
         }
         if let Some(Seeing { rendering, encoding }) = self.seeing {
             let (query, policy) = (self.latency.0, (self.latency.0 - encoding).max(0.0));

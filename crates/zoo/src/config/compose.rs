@@ -28,7 +28,12 @@ impl Layers {
     }
 
     fn title(&self) -> &str {
-        self.top("title").and_then(Value::as_str).unwrap_or_default()
+        self.top("title").and_then(Value::as_str).unwrap_or(self.name())
+    }
+
+    /// Of the file itself.
+    fn name(&self) -> &str {
+        self.layers.last().map_or("", |(name, _)| name)
     }
 
     fn inputs(&self) -> Option<Vec<&str>> {

@@ -17,18 +17,18 @@ pub struct Extended {
     pub name: String,
     /// The experiment with more steps.
     pub experiment: Experiment,
-    /// Its folder, beside the finished one's: `TrainRequest` resumes it.
+    /// Its folder: `TrainRequest` resumes it.
     pub folder: PathBuf,
     /// The command that trains the same from the beginning, where the finished run has one.
     pub command: Option<String>,
 }
 
-/// Makes a run of the finished one in `run` that ends after `steps` steps. It ends in the bytes of a run that had this many steps
+/// Makes a run below `runs` of the finished one in `run` that ends after `steps` steps. It ends in the bytes of a run that had this many steps
 /// from the beginning; so the learning rate must not depend on their number.
 ///
 /// # Errors
 /// A run that is not finished or is no robot policy's; a schedule that depends on the number of steps; no more steps than it has.
-pub fn extend(run: &Path, steps: u64) -> Result<Extended, ZooError> {
+pub fn extend(run: &Path, runs: &Path, steps: u64) -> Result<Extended, ZooError> {
     let nothing = |reason: &str| ZooError::NothingToResume { folder: run.to_owned(), reason: reason.to_owned() };
     let Some(entry) = finished_entry(run)? else {
         return Err(nothing("it is not finished; --resume continues it"));
@@ -40,27 +40,22 @@ pub fn extend(run: &Path, steps: u64) -> Result<Extended, ZooError> {
         return Err(nothing("it is no training of a robot policy"));
     };
     let mut experiment = Experiment::from_toml(&name, &read("config.toml")?)?;
-    let wrong =
-        |key: &str, expected: String, found: String| ZooError::InvalidValue { key: key.to_owned(), expected, found };
     if experiment.train.schedule != Schedule::Constant {
-        let expected = format!(
-            "constant: the rates of the steps done depend on their number otherwise; `--from {entry}` begins another training \
-             with its weights"
+        let reason = format!(
+            "cannot be extended, because its cosine schedule depends on the number of steps. Train with \
+             train.schedule=constant, or begin another training with its weights: --from {entry}"
         );
-        return Err(wrong("train.schedule", expected, "cosine".to_owned()));
+        return Err(ZooError::NotPossible { what: format!("run {}", run.display()), reason });
     }
     if steps <= experiment.train.steps {
         let expected = format!("more than the {} of the finished run", experiment.train.steps);
-        return Err(wrong("train.steps", expected, steps.to_string()));
+        return Err(ZooError::InvalidValue { key: "train.steps".to_owned(), expected, found: steps.to_string() });
     }
     experiment.train.steps = steps;
     let more = format!(" train.steps={steps}");
     let command = run.join("begun.txt").is_file().then(|| read("begun.txt")).transpose()?;
     let command = command.map(|begun| begun.trim_end().to_owned() + &more);
-    let parent = run.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    let group = parent.file_name().map_or_else(|| name.clone(), |group| group.to_string_lossy().into_owned());
-    let runs = parent.parent().filter(|_| parent.file_name().is_some()).unwrap_or(Path::new("."));
-    let folder = RunFolder::next(runs, &group)?;
+    let folder = RunFolder::next(runs, &name)?;
     copy(
         run,
         folder.path(),

@@ -16,6 +16,7 @@ const BEGUN: &str = "begun.txt";
 pub(super) const NOTE: &str = "run.json";
 /// The resolved experiment.
 const CONFIG: &str = "config.toml";
+const FINISHED: &str = "finished.json";
 
 /// A run's folder, locked for as long as this value lives.
 #[derive(Debug)]
@@ -84,18 +85,20 @@ impl RunFolder {
         Ok(folder)
     }
 
-    /// Takes up the latest run of `experiment`.
+    /// Takes up the latest run of `experiment` that is not finished.
     ///
     /// # Errors
     /// As [`RunFolder::resume`].
     pub fn resume_latest(runs: &Path, experiment: &str) -> Result<Self, ZooError> {
         let parent = runs.join(experiment);
-        let latest = match parent.is_dir() {
-            true => numbers(&parent)?.pop(),
-            false => None,
+        let all = match parent.is_dir() {
+            true => numbers(&parent)?,
+            false => Vec::new(),
         };
-        match latest {
-            Some(number) => Self::resume(&parent.join(format!("{number:03}"))),
+        let folders: Vec<PathBuf> = all.iter().rev().map(|number| parent.join(format!("{number:03}"))).collect();
+        let begun = |folder: &&PathBuf| folder.join(CONFIG).exists() && !folder.join(FINISHED).exists();
+        match folders.iter().find(begun).or(folders.first()) {
+            Some(folder) => Self::resume(folder),
             None => Err(ZooError::NothingToResume { folder: parent, reason: "no run was begun there".to_owned() }),
         }
     }
@@ -141,7 +144,7 @@ impl RunFolder {
 
     /// Written last; its presence says that the run is finished.
     pub fn finished_path(&self) -> PathBuf {
-        self.path.join("finished.json")
+        self.path.join(FINISHED)
     }
 
     /// The entry that the run is about to get.
@@ -244,5 +247,10 @@ mod tests {
         fs::write(root.path().join("e/003/config.toml"), "").unwrap();
         let folder = RunFolder::resume_latest(root.path(), "e").unwrap();
         assert!(folder.path().ends_with("e/003"));
+        // a later one that is finished hides no other
+        fs::write(folder.finished_path(), "{}").unwrap();
+        drop(folder);
+        fs::write(root.path().join("e/001/config.toml"), "").unwrap();
+        assert!(RunFolder::resume_latest(root.path(), "e").unwrap().path().ends_with("e/001"));
     }
 }

@@ -33,9 +33,9 @@ const GOES_ON: &str = "stopped; run the same command again to resume";
 /// order of the episodes, N-SCORE and SAVI. Such results have no seal and are not ranked.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
-  actrm-zoo compare lift-act lift-actrm
+  actrm-zoo compare lift-act-s1 lift-actrm-s1
   actrm-zoo compare 'lift-act-s*' 'lift-actrm-s*'
-  actrm-zoo compare stack-act@1 stack-act@2 --until-decided --max-episodes 500
+  actrm-zoo compare stack-act-s1 stack-actrm-s1 --until-decided --max-episodes 500
   actrm-zoo compare lift-act lift-act --json
   actrm-zoo compare lift-act outputs/eval_info.json --task Lift
   actrm-zoo compare results.csv:mine results.csv:theirs")]
@@ -271,7 +271,7 @@ impl<'a> Told<'a> {
             let share = |x: f64| format!("{:.1}%", x * 1e2);
             let Estimate { value, low, high } = found.estimate;
             text.push_str(&format!(
-                "  of the way {} and {}, difference {} points [{}, {}], p {}\n",
+                "  mean progress {} and {}, difference {} points [{}, {}], p {}\n",
                 share(one.value),
                 share(two.value),
                 points(value),

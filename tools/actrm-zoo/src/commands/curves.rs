@@ -15,7 +15,7 @@ use crate::places::{ZooArgs, entry_names};
 #[command(after_help = "Examples:
   actrm-zoo curves lift-act
   actrm-zoo curves 'lift-act-s*' --svg curves.svg
-  actrm-zoo curves lift-act@1 lift-act@2 --json")]
+  actrm-zoo curves lift-act-s1 lift-act-s2 --json")]
 pub struct Args {
     /// Entries: `name` (its newest version), `name@version`, or a pattern with `*`
     #[arg(required = true, add = entry_names())]
@@ -56,7 +56,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             Some(Curve { entry: entry.id().to_string(), points })
         };
         let curves: Vec<Curve> = entries.iter().filter_map(curve).collect();
-        cli::make_parent(path)?;
+        let _parents = cli::make_parent(path)?;
         write_atomic(path, curves_svg(&curves).as_bytes())?;
         cli::print(&(shown(path) + "\n"))?;
         return Ok(ExitCode::SUCCESS);

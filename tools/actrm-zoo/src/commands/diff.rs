@@ -18,8 +18,8 @@ use crate::places::{ProtocolArgs, ResultsArgs, ZooArgs, entry_names};
 /// some steps.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
-  actrm-zoo diff lift-act@1 lift-act@2
-  actrm-zoo diff lift-act lift-actrm --json")]
+  actrm-zoo diff lift-act-s1 lift-act-s2
+  actrm-zoo diff lift-act-s1 lift-actrm-s1 --json")]
 pub struct Args {
     /// First entry: `name` (its newest version), `name@version` or `name@alias`
     #[arg(add = entry_names())]

@@ -7,6 +7,7 @@ use std::process::ExitCode;
 use anyhow::{Context, bail};
 use cli::{INTERRUPTED, Screen, Stop, limits, shown};
 use models::{DeviceChoice, FeatureKind};
+use recording::CollectOptions;
 use report::{COLUMNS, LeaderboardRow, json};
 use rollout::{Pool, Ready, remembered_greeting};
 use serde_json::{Value, json};
@@ -54,8 +55,8 @@ fn there(evaluation: &StoredEvaluation) -> &'static str {
   actrm-zoo eval trm-dfs10 --task dfs16 --depth 32
   actrm-zoo eval trm-dfs10 --task dfs20 --depth 64 --views 8 --starts 2 --judge cells
   actrm-zoo eval lift-act --episodes 3 --video 3
-  actrm-zoo eval lift-act-image --episodes 100 --video-failed 3
-  actrm-zoo eval lift-act-image --episodes 100 --perturb black-agentview
+  actrm-zoo eval lift-act-image-s1 --episodes 100 --video-failed 3
+  actrm-zoo eval lift-act-image-s1 --episodes 100 --perturb black-agentview
   actrm-zoo eval lift-act --episodes 50 --again
   actrm-zoo eval lift-act --episodes 50 --robots Sawyer
   actrm-zoo eval lift-act --episodes 200 --shard 2/8
@@ -81,7 +82,8 @@ pub struct Args {
     /// Episodes per entry [default: 20]
     #[arg(long, short = 'n', help_heading = EPISODES, value_name = "N", value_parser = limits::episodes)]
     episodes: Option<u64>,
-    /// Seed of the first episode, or of the puzzles of a solver; the seeds after it count up [default: 10000]
+    /// Seed of the first episode; the seeds after it count up [default: 10000]. Of a puzzle solver, the seed of its test puzzles
+    /// [default: 20000]
     #[arg(long = "seed-start", help_heading = EPISODES, alias = "seed", value_name = "SEED")]
     seed: Option<u64>,
     /// Actions that are executed before the next query of the policy [default: the entry's]
@@ -260,6 +262,16 @@ fn note_unrecorded(meta: &EntryMeta, ready: &Ready) {
     }
 }
 
+/// Says so where the seeds are those of a collection of ours, and nobody wrote down which the demonstrations had.
+fn note_seeds(meta: &EntryMeta, seeds: Seeds) {
+    if meta.data.as_ref().is_some_and(|data| data.seeds.is_none()) && seeds.iter().end > CollectOptions::SEED_STRIDE {
+        let id = meta.id();
+        cli::note(&format!(
+            "note: {id}: the seeds of its demonstrations are not recorded; it may have been trained on these episodes"
+        ));
+    }
+}
+
 /// An entry whose policy is to be evaluated; one that solves puzzles is evaluated at once.
 fn open(
     args: &Args,
@@ -290,8 +302,8 @@ fn open(
     let (task, results) = (args.run.task.as_deref(), args.results.folder(&args.zoo));
     // seeds of episodes are no seeds of puzzles where both kinds are evaluated
     let seed = args.seed.filter(|_| named);
-    if let Some((line, value)) = puzzles::evaluate(&entry, of_robots, task, &args.puzzles, seed, args.again, &results)?
-    {
+    let of_puzzles = puzzles::Asked { of_robots, task, args: &args.puzzles, seed, again: args.again, named };
+    if let Some((line, value)) = puzzles::evaluate(&entry, &of_puzzles, &results)? {
         says.say(&(line + "\n"), value)?;
         return Ok(None);
     }
@@ -334,6 +346,7 @@ fn evaluate_on(
     for entry in entries {
         note_other_module(entry.entry().meta(), pool.ready().module_sha256.as_deref());
         note_unrecorded(entry.entry().meta(), pool.ready());
+        note_seeds(entry.entry().meta(), options.seeds);
     }
     for subject in &subjects {
         if let Err(error) = evaluate_entry((args, asked), &options, subject, &mut pool, stop, says) {

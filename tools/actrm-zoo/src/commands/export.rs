@@ -78,20 +78,20 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let (entry, folder) = match &args.to {
         To::Lerobot(args) => {
             let entry = args.zoo.registry().entry(&args.entry)?;
-            cli::make_parent(&args.folder)?;
+            let _parents = cli::make_parent(&args.folder)?;
             export(&entry, &args.folder)?;
             (entry, &args.folder)
         }
         To::Onnx(args) => {
             let entry = args.zoo.registry().entry(&args.entry)?;
-            cli::make_parent(&args.file)?;
+            let _parents = cli::make_parent(&args.file)?;
             onnx::export(&entry.load()?, &args.file)?;
             (entry, &args.file)
         }
         To::Hub(args) => {
             let entry = args.zoo.registry().entry(&args.entry)?;
             let results = model_index_of(&entry, &args.zoo, &args.results, &args.protocols)?;
-            cli::make_parent(&args.folder)?;
+            let _parents = cli::make_parent(&args.folder)?;
             export_hub(&entry, &args.folder, &results)?;
             (entry, &args.folder)
         }

@@ -143,8 +143,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             files.push((path, text.into_bytes()));
         }
     }
+    let _parents = args.markdown.as_deref().map(cli::make_parent).transpose()?;
     if let Some(file) = &args.markdown {
-        cli::make_parent(file)?;
         files.push((file.clone(), markdown::table(COLUMNS, &rows).into_bytes()));
     }
     // all of them or none: a table beside a report of other results would be worse than an old pair

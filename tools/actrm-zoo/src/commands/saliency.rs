@@ -20,8 +20,8 @@ use crate::simulation::{drawn, worker};
 /// deviations of the demonstrations' actions) and the place of the most important square.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
-  actrm-zoo saliency lift-act-image --out saliency.png
-  actrm-zoo saliency lift-act-image@1 --seed 40007 --queries 4 --out saliency.png")]
+  actrm-zoo saliency lift-act-image-s1 --out saliency.png
+  actrm-zoo saliency lift-act-image-s1 --seed 40007 --queries 4 --out saliency.png")]
 pub struct Args {
     /// Entry: `name` (its newest version) or `name@version`
     #[arg(add = entry_names())]
@@ -75,7 +75,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         return Ok(ExitCode::from(INTERRUPTED));
     };
     let file = looked.strip().to_png().with_context(|| format!("{}: cannot draw it", shown(&args.out)))?;
-    cli::make_parent(&args.out)?;
+    let _parents = cli::make_parent(&args.out)?;
     write_atomic(&args.out, &file)?;
     match args.json {
         true => cli::print_json(&looked)?,

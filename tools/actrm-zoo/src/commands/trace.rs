@@ -23,8 +23,8 @@ use crate::simulation::{drawn, worker};
   actrm-zoo trace trm-open8@1 --index 7 --svg trace.svg
   actrm-zoo trace trm-dfs10 --task dfs16 --depth 24
   actrm-zoo trace trm-sudoku4 --json
-  actrm-zoo trace lift-actrm --seed 10003
-  actrm-zoo trace lift-actrm --seed 10003 --parquet trace.parquet
+  actrm-zoo trace lift-actrm-s1 --seed 10003
+  actrm-zoo trace lift-actrm-s1 --seed 10003 --parquet trace.parquet
   actrm-zoo trace pickchain-actrm --seed 30000 --svg attention.svg
   actrm-zoo trace tablemaze-actrm --seed 30000 --svg way.svg")]
 pub struct Args {
@@ -125,7 +125,7 @@ fn trace_policy(args: &Args, entry: &Entry) -> anyhow::Result<ExitCode> {
         traced.write_parquet(path)?;
     }
     if let (Some(path), Some(svg)) = (&args.svg, traced.way_svg().or_else(|| traced.attention_svg())) {
-        cli::make_parent(path)?;
+        let _parents = cli::make_parent(path)?;
         write_atomic(path, svg.as_bytes())?;
         cli::note(&shown(path));
     }

@@ -62,7 +62,7 @@ pub struct Args {
     #[arg(long, value_name = "ENTRY", add = entry_names())]
     from: Option<String>,
     /// Continue the finished run in this folder, in a new folder, to `train.steps=N`; its schedule must be constant
-    #[arg(long, value_name = "RUN", conflicts_with_all = ["run", "resume", "seeds", "data", "from", "runs"])]
+    #[arg(long, value_name = "RUN", conflicts_with_all = ["run", "resume", "seeds", "data", "from"])]
     extend: Option<PathBuf>,
     /// Train even if the demonstrations are of another task or their dimensions have other names
     #[arg(long)]
@@ -73,7 +73,7 @@ pub struct Args {
     /// Folder of this run, new or empty
     #[arg(long, value_name = "DIR")]
     run: Option<PathBuf>,
-    /// Resume the latest run of this experiment, or the one in --run
+    /// Resume the latest run of this experiment that is not finished, or the one in --run
     #[arg(long)]
     resume: bool,
     /// Train once with each of these seeds: `1..8` (both ends included), `3` or `1,4,7`
@@ -137,13 +137,18 @@ impl Args {
     }
 }
 
-/// The error of a value, with Rust's names of numbers in words.
+/// The error of a value, with Rust's names of types in words.
 fn in_words(error: ZooError) -> ZooError {
     match error {
-        ZooError::InvalidValue { key, expected, found }
-            if ["u64", "u32", "u16", "u8", "usize"].contains(&&*expected) =>
-        {
-            ZooError::InvalidValue { key, expected: "a positive integer".to_owned(), found }
+        ZooError::InvalidValue { key, expected, found } => {
+            let words = match &*expected {
+                "u64" | "u32" | "u16" | "u8" | "usize" => "a positive integer",
+                "f64" | "f32" => "a number",
+                "a boolean" => "true or false",
+                "a sequence" => "a list, such as '[\"agentview\"]'",
+                other => other,
+            };
+            ZooError::InvalidValue { key, expected: words.to_owned(), found }
         }
         other => other,
     }
@@ -231,7 +236,7 @@ fn extend_run(args: &Args, run: &Path) -> anyhow::Result<ExitCode> {
     let (Some(steps), None) = (steps, set.next()) else {
         bail!("--extend: expected train.steps=N and no other setting beside it");
     };
-    let Extended { name, experiment, folder, command } = extend(run, steps)?;
+    let Extended { name, experiment, folder, command } = extend(run, &args.runs, steps)?;
     let stop = Stop::install("stopped without a new checkpoint; the new run's folder says how to resume")?;
     let resume = command.as_ref().map(|command| {
         let mut words: Vec<OsString> = vec!["--zoo".into(), args.zoo.zoo.clone().into()];
@@ -289,9 +294,13 @@ struct One {
     own: Vec<String>,
 }
 
-/// An error, with what to do where demonstrations are missing.
+/// An error, with what to do where demonstrations are missing or a run began with other settings.
 fn where_data_is(error: ZooError, task: &str) -> anyhow::Error {
     match error {
+        ZooError::ResumeMismatch { ref folder, .. } => match std::fs::read_to_string(folder.join(COMMAND_FILE)) {
+            Ok(command) => anyhow!("{error}; it is resumed by: {}", command.trim_end()),
+            Err(_) => error.into(),
+        },
         ZooError::DataNotFound { path, .. } => anyhow!(
             "no demonstrations at {}: name yours with --data PATH, or record some with `actrm-data collect --task {task} \
              --episodes 200 --out demos.hdf5`",

@@ -127,8 +127,8 @@ fn deep_check(entry: &Entry) -> anyhow::Result<String> {
     check_meta(&loaded)?;
     Ok(match loaded.repeats()? {
         Repeats::NotStored => "; no reference output is stored".to_owned(),
-        Repeats::Exactly => "; it gives the stored actions again, bit for bit".to_owned(),
-        Repeats::Within(far) => format!("; it gives the stored actions again, no value further off than {far:.1e}"),
+        Repeats::Exactly => "; it predicts the stored actions bit for bit".to_owned(),
+        Repeats::Within(far) => format!("; it predicts the stored actions to within {far:.1e}"),
     })
 }
 
