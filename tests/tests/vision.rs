@@ -94,7 +94,7 @@ fn from_cameras_to_the_leaderboard() {
     let again = text_of(eval("lift-act-image@1", &entries, &["--episodes", "2", "--again"]));
     assert!(again.contains("2 episodes run again, every outcome the same"), "{again}");
     let changed = text_of(eval("lift-act-image@1", &entries, &["--episodes", "2", "--perturb", "black-agentview"]));
-    assert!(changed.contains("lift-act-image@1 on Lift, black-agentview: 0 of 2"), "{changed}");
+    assert!(changed.contains("lift-act-image@1 on Lift, black-agentview, seeds 10000-10001: 0 of 2"), "{changed}");
     refused(
         &mut eval("lift-act-image@1", &entries, &["--episodes", "2", "--perturb", "black-frontview"]),
         &["lift-act-image@1", "black-frontview", "camera frontview, found agentview, robot0_eye_in_hand"],
