@@ -313,7 +313,7 @@ fn what_does_not_fit_is_refused_before_anything_is_written() {
     assert!(error.contains("seed 10000, step 0: action: expected 7 finite values, found NaN at index 2"), "{error}");
     // episodes that begin as its demonstrations did are no test
     let error = refuse(|s| s.demonstrations = Some(Seeds { start: 9_990, count: 11 }));
-    assert!(error.contains("seeds 10000") && error.contains("used 9990-10000"), "{error}");
+    assert!(error.contains("seeds 10000") && error.contains("began with 9990-10000"), "{error}");
     // forced, the other generation is evaluated
     let forced = EvaluationOptions { force: true, ..wanted(1) };
     let other = Subject { env_version: None, ..subject() };
