@@ -21,6 +21,8 @@ CARGO := cargo
 CARGO_FLAGS := --release --locked
 # cmake (HDF5 is built from source) comes from .venv; pip must not look outside the lock file's hashes.
 export PATH := $(CURDIR)/.venv/bin:$(PATH)
+# the scripts and tests look for programs in target/
+unexport CARGO_TARGET_DIR
 PIP := pip install --disable-pip-version-check --no-input --quiet --require-hashes --no-deps
 
 .PHONY: help
@@ -99,7 +101,8 @@ CUDA_COMPUTE_CAP ?= 80
 cuda: .venv/.complete $(if $(filter $(OWN_CUDA),$(CUDA_HOME)),.venv-cuda/.complete) ## actrm-zoo for NVIDIA's GPUs, in target/cuda/release (docs/howto/gpu.md)
 	@export CUDA_HOME="$(CUDA_HOME)" CUDA_COMPUTE_CAP=$(CUDA_COMPUTE_CAP) PATH="$(CUDA_HOME)/bin:$$PATH"; \
 	    for target in "--bin actrm-zoo" "--example gpu_check"; do \
-	      $(CARGO) rustc $(CARGO_FLAGS) --target-dir target/cuda -p actrm-zoo --features cuda $$target -- -C link-arg=-Wl,-rpath,"$(CUDA_HOME)/lib"; \
+	      $(CARGO) rustc $(CARGO_FLAGS) --target-dir target/cuda -p actrm-zoo --features cuda $$target -- \
+	        -C link-arg=-Wl,-rpath,"$(CUDA_HOME)/lib" -C link-arg=-Wl,-rpath,"$(CUDA_HOME)/lib64"; \
 	    done
 
 # ---- the main job ---------------------------------------------------------------------------------------------

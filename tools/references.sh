@@ -16,7 +16,7 @@ done
 # what the packages need to train, beside what they bring along, in a folder of its own
 lock=benches/peers/training.lock
 if ! cmp -s "$lock" "$work/python/training.lock"; then
-    rm -rf "$work/python"
+    rm -rf "$work/python" "$work/python.part"
     mkdir -p "$work"
     .venv-peers/bin/python -m pip install --disable-pip-version-check --no-input --quiet --require-hashes --no-deps \
         --target "$work/python.part" -r "$lock"

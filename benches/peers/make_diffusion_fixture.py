@@ -5,7 +5,7 @@
 needs LeRobot 0.6.1 with its extra `diffusion` (diffusers 0.38), and torch. Each fixture is a folder with config.json,
 model.safetensors, draws.npz (inputs, noise, the network's output, the loss, actions drawn with DDIM and DDPM) and
 gradients.safetensors (of the loss).
-`ACTRM_PARITY_DIR=OUT_FOLDER cargo test --release --test diffusion_parity` then holds ours to them.
+`ACTRM_PARITY_DIR=OUT_FOLDER cargo test --release -p models --test parity` then holds ours to them.
 """
 
 import argparse

@@ -4,8 +4,8 @@
 
 needs robomimic 0.3 and torch. Each fixture is a folder with config.json (`type` and options under our names),
 model.safetensors (under ours, too), robomimic.npz (inputs, the mixtures' parameters, log-likelihoods, the loss) and
-gradients.safetensors (of the loss, dropout off). `ACTRM_PARITY_DIR=OUT_FOLDER cargo test --release --test
-robomimic_parity` then holds ours to them.
+gradients.safetensors (of the loss, dropout off). `ACTRM_PARITY_DIR=OUT_FOLDER cargo test --release -p models
+--test parity` then holds ours to them.
 """
 
 import argparse

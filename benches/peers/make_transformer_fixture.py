@@ -5,7 +5,7 @@
 needs torch and a checkout of https://github.com/real-stanford/diffusion_policy (5ba07ac6661d; it has no releases).
 Each fixture is a folder with config.json, model.safetensors, transformer.npz (inputs, the network's output, the mean
 squared error to `eps`) and gradients.safetensors (of that error).
-`ACTRM_PARITY_DIR=OUT_FOLDER cargo test --release --test diffusion_parity` then holds ours to them.
+`ACTRM_PARITY_DIR=OUT_FOLDER cargo test --release -p models --test parity` then holds ours to them.
 """
 
 import argparse

@@ -1,6 +1,6 @@
 """Trainings by the references themselves, judged by our harness: `tools/references.sh` runs this.
 
-    python references.py --data FOLDER [--only WORD] [--stop-after train|eval]
+    python references.py --data FOLDER [--only WORD] [--train-only]
 
 For every cell (policy, task, seed) the demonstrations of the cell in `studies/policies.toml` are learned from by
 other people's code: ACT by LeRobot's `lerobot_train` on a data set that `actrm-data` converted, BC-RNN by robomimic's

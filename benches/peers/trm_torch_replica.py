@@ -12,7 +12,7 @@ prints one JSON line with the smallest and median wall and CPU seconds of a step
     python benches/peers/trm_torch_replica.py --fixture DIR --seed 7 --hidden 48 --heads 4 --length 20 --layers 1
 
 writes DIR/config.json, model.safetensors (the official names) and io.safetensors (four supervision steps): with
-ACTRM_PARITY_DIR=DIR, `cargo test -p models --test trm_parity` holds our model to it.
+ACTRM_PARITY_DIR=DIR, `cargo test -p solvers --test trm_parity` holds our model to it.
 """
 
 import argparse

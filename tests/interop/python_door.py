@@ -94,6 +94,24 @@ def compare_loaders(root: Path) -> str:
     return f"{len(plain)} batches, with workers forked and spawned"
 
 
+def tensors_are_taken(entry: Path) -> str:
+    """A policy takes PyTorch's tensors: with a gradient, of half precision and bfloat16."""
+    import actrm
+
+    policy = actrm.load_policy(entry)
+    draw = np.random.default_rng(1)
+    one = {
+        name: draw.random(shape).astype(np.float16).astype(np.float32) for name, shape in policy.input_features.items()
+    }
+    wanted = policy.predict_action_chunk(one)
+    for form in (lambda t: t, lambda t: t.requires_grad_(), lambda t: t.half()):
+        given = {name: form(torch.from_numpy(value.copy())) for name, value in one.items()}
+        np.testing.assert_array_equal(policy.predict_action_chunk(given), wanted)
+    given = {name: torch.from_numpy(value).bfloat16() for name, value in one.items()}
+    assert policy.predict_action_chunk(given).shape == wanted.shape
+    return "float32, with a gradient, half precision, bfloat16"
+
+
 def compare_chunks(root: Path, checkpoint: Path) -> str:
     """A checkpoint of LeRobot's, loaded by the package, plans what LeRobot plans, to 1e-5."""
     import actrm

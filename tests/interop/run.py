@@ -707,6 +707,7 @@ def main() -> None:
             "from Python: LeRobot's samples with depth": lambda: python_door.compare_samples(folder / "depth" / "set"),
             "from Python: LeRobot's samples with videos": lambda: python_door.compare_samples(folder / "video"),
             "from Python: PyTorch's loader": lambda: python_door.compare_loaders(root),
+            "from Python: a policy takes tensors": lambda: python_door.tensors_are_taken(ROOT / "zoo" / "lift-act"),
             "from Python: the PyTorch example of docs/howto/five_commands.md": lambda: python_door.how_to(
                 folder / "howto"
             ),

@@ -121,6 +121,9 @@ def compare_shards(program: Path, lift: Path, folder: Path) -> str:
         assert "exists already" in convert(
             program, "s3://lab/aloha", "s3://lab/set", "--shards", "3", *staged, fails=True
         )
+        # shards of other arguments are not taken for those that are asked for
+        said = convert(program, "s3://lab/aloha", "s3://lab/set", "--shards", "3", *staged, "--", "--video", fails=True)
+        assert "with other arguments" in said, said
         first = content_of(fs, "lab/set", folder / "fetched")
         assert first == content(folder / "set")
         # headers are no more than a part of the files

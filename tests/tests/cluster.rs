@@ -36,12 +36,25 @@ fn with_sbatch(folder: &Path) -> String {
 
 /// A study of two trainings that is over in seconds.
 const STUDY: &str = include_str!("../fixtures/small_study.toml");
+/// A later stage of it that has a training of the first once more.
+const STAGE: &str = r#"
+[tests.again]
+task = "Lift"
+episodes = 1
+seed_start = 40002
+[[cells]]
+arms = ["act"]
+data = "lift"
+seeds = 1
+tests = ["again"]
+stage = 2
+"#;
 
 #[test]
 fn a_study_as_an_array_of_cells() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let jobs = folder.path().join("jobs");
-    fs::write(folder.path().join("small.toml"), STUDY).expect("writable");
+    fs::write(folder.path().join("small.toml"), format!("{STUDY}{STAGE}")).expect("writable");
     let script = root().join("tools/cluster/slurm_study.sh");
     let zoo = program("actrm-zoo").get_program().to_owned();
     let mut command = Command::new(&script);
@@ -51,7 +64,8 @@ fn a_study_as_an_array_of_cells() {
     succeeds(&mut command);
     let said = fs::read_to_string(&jobs).expect("jobs were queued");
     assert!(said.contains("--array=1-2") && said.contains("--dependency=afterok:4711"), "{said}");
-    let results = ["act-on-lift-seed1_lift.json", "act-on-lift-seed2_lift.json", "success.svg"];
+    let results =
+        ["act-on-lift-seed1_again.json", "act-on-lift-seed1_lift.json", "act-on-lift-seed2_lift.json", "success.svg"];
     assert_eq!(listing(&folder.path().join("results")), results);
     // entries are a family, and their evaluations lie where the leaderboard looks
     assert_eq!(listing(&folder.path().join("zoo")), ["lift-act-s1", "lift-act-s2", "results"]);
@@ -66,9 +80,10 @@ fn a_study_as_an_array_of_cells() {
         let listed = command.args(["study", "small.toml", "--list"]).current_dir(folder.path()).output();
         String::from_utf8(listed.expect("it runs").stdout).expect("text")
     };
-    assert_eq!(list(), "act-on-lift-seed1: lift (0 of 2)\nact-on-lift-seed2: lift (0 of 2)\n");
-    fs::remove_file(folder.path().join("results").join(results[1])).expect("was there");
-    assert_eq!(list(), "act-on-lift-seed1: lift (0 of 2)\nact-on-lift-seed2: lift (not run)\n");
+    let (first, second) = ("act-on-lift-seed1: lift (0 of 2), again (0 of 1)\n", "act-on-lift-seed2: lift (0 of 2)\n");
+    assert_eq!(list(), format!("{first}{second}"));
+    fs::remove_file(folder.path().join("results").join(results[2])).expect("was there");
+    assert_eq!(list(), format!("{first}act-on-lift-seed2: lift (not run)\n"));
 
     let mut unknown = program("actrm-zoo");
     unknown.args(["study", "small.toml", "--work", "work", "--cell", "act-on-lift"]).current_dir(folder.path());
@@ -125,13 +140,15 @@ fn an_array_of_shards_and_the_job_that_merges_them() {
     let (jobs, path) = (folder.path().join("jobs"), with_sbatch(folder.path()));
     let script = root().join("tools/cluster/slurm_eval.sh");
     let mut command = Command::new(&script);
+    let place = folder.path().join("elsewhere");
     command.args(["3", "lift-act@1", "--episodes", "4", "--max-steps", "3", "--zoo", text(&entries)]);
+    command.args(["--results", text(&place)]);
     let zoo = program("actrm-zoo").get_program().to_owned();
     succeeds(command.env("PATH", path).env("ACTRM_ZOO", zoo).env("JOBS", &jobs).current_dir(root()));
     let jobs = fs::read_to_string(jobs).expect("jobs were queued");
     assert!(jobs.contains("--array=1-3") && jobs.contains("--dependency=afterok:4711"), "{jobs}");
     assert!(jobs.contains("of 4 episodes succeeded"), "{jobs}");
-    let results = listing(&entries.join("results"));
+    let results = listing(&place);
     assert_eq!(results.iter().filter(|name| name.contains("_shard-")).count(), 3, "{results:?}");
     assert_eq!(results.iter().filter(|name| !name.contains("_shard-")).count(), 1, "{results:?}");
     let refused = Command::new(&script).args(["none", "lift-act@1"]).output().expect("it starts");

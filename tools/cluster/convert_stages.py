@@ -53,7 +53,35 @@ def files_of(fs: Any, folder: str) -> dict[str, int]:
     """Names and sizes of the files below a folder."""
     prefix = folder.rstrip("/") + "/"
     found = fs.find(folder, detail=True)
-    return {name.removeprefix(prefix): entry["size"] for name, entry in sorted(found.items())}
+    return {below(name.removeprefix(prefix)): entry["size"] for name, entry in sorted(found.items())}
+
+
+def below(name: str) -> str:
+    """The name of a file below a folder; one that leads out of it ends the program."""
+    if name.startswith("/") or ".." in name.split("/"):
+        raise SystemExit(f"{name!r}: expected the name of a file below the source's folder")
+    return name
+
+
+def origin(source: str, arguments: list[str]) -> bytes:
+    """What a conversion is made of: the arguments, and the names and sizes of the source's files."""
+    if is_plain(source):
+        root = Path(source)
+        files = {
+            str(file.relative_to(root)): file.stat().st_size
+            for file in sorted([root, *root.rglob("*")])
+            if file.is_file()
+        }
+    else:
+        fs, path = place(source)
+        files = files_of(fs, path) if fs.isdir(path) else {"": fs.size(path)}
+    return json.dumps({"source": source, "arguments": arguments, "files": files}, indent=1).encode()
+
+
+def check_origin(fs: Any, path: str, now: bytes, what: str) -> None:
+    """End the program where something was made of other files or with other arguments."""
+    if not fs.exists(path) or fs.cat_file(path) != now:
+        raise SystemExit(f"{what}: made of other files or with other arguments; remove it or choose another OUT")
 
 
 def unneeded(file: Any) -> list[tuple[int, int]]:
@@ -116,8 +144,12 @@ def plan(source: str, out: str) -> str:
     if not any(Path(name).suffix.lower() in EXTENSIONS for name in files):
         return f"{source}: no folder of HDF5 files; read whole by every shard"
     target, path = place(f"{shards_of(out)}/{HEADERS}")
-    if not target.exists(path):
+    made_of, record = origin(source, []), f"{path}.json"
+    if target.exists(path):
+        check_origin(target, record, made_of, f"{shards_of(out)}/{HEADERS}")
+    else:
         target.makedirs(path.rpartition("/")[0], exist_ok=True)
+        target.pipe_file(record, made_of)
         with tempfile.TemporaryFile() as packed:
             with gzip.GzipFile(fileobj=packed, mode="wb", compresslevel=1, mtime=0) as to:
                 for name, size in files.items():
@@ -125,7 +157,9 @@ def plan(source: str, out: str) -> str:
                         write_header(to, fs, f"{folder}/{name}", name, size)
                     else:
                         to.write(json.dumps({"name": name, "size": size, "kept": [(0, size)]}).encode() + b"\n")
-                        to.write(fs.cat_file(f"{folder}/{name}"))
+                        with fs.open(f"{folder}/{name}", "rb") as whole:
+                            while block := whole.read(1 << 20):
+                                to.write(block)
             packed.seek(0)
             with target.open(path, "wb") as sink:
                 while block := packed.read(1 << 20):
@@ -138,7 +172,7 @@ def unpack(headers: BinaryIO, folder: Path) -> None:
     with gzip.GzipFile(fileobj=headers) as packed, io.BufferedReader(packed) as stream:
         while line := stream.readline():
             entry = json.loads(line)
-            path = folder / entry["name"]
+            path = folder / below(entry["name"])
             path.parent.mkdir(parents=True, exist_ok=True)
             with path.open("wb") as file:
                 file.truncate(entry["size"])
@@ -196,7 +230,9 @@ def convert(source: str, out: str, shard: str, arguments: list[str], scratch: st
     kept = f"{shards_of(out)}/{shard.replace('/', '-of-')}"
     if not is_plain(out):
         fs, path = place(kept)
+        made_of, record = origin(source, arguments), f"{path}.json"
         if fs.exists(f"{path}/shard.json"):
+            check_origin(fs, record, made_of, kept)
             return f"{kept}: there already"
     with tempfile.TemporaryDirectory(dir=scratch, prefix="actrm-shard-") as folder:
         local = Path(folder)
@@ -205,6 +241,8 @@ def convert(source: str, out: str, shard: str, arguments: list[str], scratch: st
         made.parent.mkdir(parents=True, exist_ok=True)
         said = call(["convert", staged, made, "--shard", shard, *arguments])
         if not is_plain(out):
+            fs.makedirs(record.rpartition("/")[0], exist_ok=True)
+            fs.pipe_file(record, made_of)
             put(made, kept, "shard.json")
         return said.strip().replace(str(made), kept)
 

@@ -50,9 +50,19 @@ def main() -> int:
     if failed:
         print(f"{failed} of {args.shards} shards failed; the same command tries these again", file=sys.stderr)
         return 1
-    zoo = [part for at, part in enumerate(args.eval) if part == "--zoo" or (at and args.eval[at - 1] == "--zoo")]
-    zoo += [part for part in args.eval if part.startswith("--zoo=")]
-    return subprocess.run([args.program, "merge", *zoo]).returncode
+    return subprocess.run([args.program, "merge", *places(args.eval)]).returncode
+
+
+def places(arguments: list[str]) -> list[str]:
+    """Where the shards are: what of the arguments of `eval` are folders that `merge` takes too."""
+    names = ("--zoo", "--results")
+    given = []
+    for at, part in enumerate(arguments):
+        if part in names:
+            given += arguments[at : at + 2]
+        elif part.startswith(tuple(f"{name}=" for name in names)):
+            given.append(part)
+    return given
 
 
 if __name__ == "__main__":

@@ -27,12 +27,11 @@ def main() -> int:
     cut = words.index("--") if "--" in words else len(words)
     args = parser.parse_args(words[:cut])
     base = [args.program, "study", args.study, *words[cut + 1 :]]
-    listed = subprocess.run([args.program, "study", args.study, "--list"], capture_output=True, text=True)
+    listed = subprocess.run([*base, "--list"], capture_output=True, text=True)
     if listed.returncode:
         sys.stderr.write(listed.stderr)
         return listed.returncode
-    # a training that stands in two stages is one line each, under one name
-    cells = list(dict.fromkeys(line.split(":")[0] for line in listed.stdout.splitlines()))
+    cells = [line.split(":")[0] for line in listed.stdout.splitlines()]
     if (code := subprocess.run([*base, "--data-only"]).returncode) != 0:
         return code
     ray.init(address=args.address, include_dashboard=False, log_to_driver=False)

@@ -16,12 +16,13 @@ fi
 shards=$1
 shift
 program=${ACTRM_ZOO:-actrm-zoo}
-zoo=zoo
+# folders that `merge` takes too
+places=()
 arguments=("$@")
 for ((i = 0; i < $#; i++)); do
     case ${arguments[i]} in
-    --zoo) zoo=${arguments[i + 1]:?--zoo needs a folder} ;;
-    --zoo=*) zoo=${arguments[i]#--zoo=} ;;
+    --zoo | --results) places+=("${arguments[i]}" "${arguments[i + 1]:?${arguments[i]} needs a folder}") ;;
+    --zoo=* | --results=*) places+=("${arguments[i]}") ;;
     esac
 done
 read -ra options <<<"${SBATCH_OPTIONS:-}"
@@ -31,5 +32,5 @@ quoted=$(printf '%q ' "$program" eval "$@")
 array=$(sbatch --parsable --requeue --job-name=actrm-eval --array="1-$shards" --cpus-per-task=2 "${options[@]}" \
     --wrap="$quoted"'--workers "$SLURM_CPUS_PER_TASK" --shard "$SLURM_ARRAY_TASK_ID/'"$shards"'"')
 merge=$(sbatch --parsable --job-name=actrm-merge --dependency="afterok:$array" --cpus-per-task=1 "${options[@]}" \
-    --wrap="$(printf '%q ' "$program" merge --zoo "$zoo")")
-echo "array $array ($shards shards), then merge $merge; results in $zoo/results"
+    --wrap="$(printf '%q ' "$program" merge "${places[@]}")")
+echo "array $array ($shards shards), then merge $merge"

@@ -19,8 +19,8 @@ shift
 program=${ACTRM_ZOO:-actrm-zoo}
 read -ra options <<<"${SBATCH_OPTIONS:-}"
 quoted() { printf '%q ' "$program" study "$study" "$@"; }
-cells=$(quoted --list)
-count=$("$program" study "$study" --list | wc -l)
+cells=$(quoted "$@" --list)
+count=$("$program" study "$study" "$@" --list | wc -l)
 
 data=$(sbatch --parsable --requeue --job-name=actrm-data --cpus-per-task=2 "${options[@]}" --wrap="$(quoted "$@" --data-only)")
 # shellcheck disable=SC2016  # the node expands these, not this shell

@@ -215,7 +215,7 @@ impl Bench {
             ours = ours.max(5_400.0 / began.elapsed().as_secs_f64());
             if let Some(peers) = &self.peers {
                 let peer_out = self.fresh("peer")?;
-                let args = [text(&file)?, text(&peer_out)?, "--level", "1"];
+                let args = [text(&file)?, text(&peer_out)?];
                 let report = peers.run("convert_h5py_pyarrow.py", &args)?;
                 let number = |key: &str| report[key].as_f64().unwrap_or(f64::NAN);
                 theirs = theirs.max(number("frames") / number("wall_seconds"));

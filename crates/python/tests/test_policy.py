@@ -139,18 +139,6 @@ def test_other_types_are_taken_as_numpy_takes_them(zoo: Path) -> None:
         np.testing.assert_array_equal(policy.predict_action_chunk(other), wanted)
 
 
-def test_tensors_are_taken(zoo: Path) -> None:
-    torch = pytest.importorskip("torch")
-    policy = actrm.load_policy(zoo / "lift-act")
-    one = {key: value.astype(np.float16).astype(np.float32) for key, value in observations(policy, 1)[0].items()}
-    wanted = policy.predict_action_chunk(one)
-    for form in (lambda t: t, lambda t: t.requires_grad_(), lambda t: t.half()):
-        given = {key: form(torch.from_numpy(value.copy())) for key, value in one.items()}
-        np.testing.assert_array_equal(policy.predict_action_chunk(given), wanted)
-    given = {key: torch.from_numpy(value).bfloat16() for key, value in one.items()}
-    assert policy.predict_action_chunk(given).shape == wanted.shape
-
-
 def test_a_feature_of_one_number_needs_no_axis(tmp_path: Path) -> None:
     """Samples have none, as in LeRobot."""
     actrm.convert(LIFT, tmp_path / "data", state_keys=["robot0_gripper_qpos[0:1]"], progress=False)
@@ -284,7 +272,9 @@ def test_every_byte_of_an_entry_is_checked(zoo: Path, tmp_path: Path) -> None:
 
 
 def test_an_unknown_entry_lists_what_there_is(zoo: Path) -> None:
-    with pytest.raises(actrm.Error, match=r"unknown entry `lfit-act` in zoo .*did you mean `lift-act`.*`actrm-zoo list` shows all"):
+    with pytest.raises(
+        actrm.Error, match=r"unknown entry `lfit-act` in zoo .*did you mean `lift-act`.*`actrm-zoo list` shows all"
+    ):
         actrm.load_policy(zoo / "lfit-act")
     for path in ("", "/", "a\0b", "..", "no/such/place"):
         with pytest.raises((actrm.Error, ValueError)):

@@ -7,7 +7,6 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
-from importlib.util import find_spec
 from pathlib import Path
 
 import actrm
@@ -244,24 +243,6 @@ print(codes)
     command = [sys.executable, "-W", "ignore", "-c", script]
     said = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False, env=TOY)
     assert (said.returncode, said.stdout, said.stderr) == (0, f"{[0] * 10}\n", "")
-
-
-@pytest.mark.skipif(not find_spec("torch"), reason="torch is not installed here")
-@pytest.mark.parametrize("method", ["fork", "spawn"])
-def test_pytorch_s_loader_gives_the_same_with_workers(lift: Path, method: str) -> None:
-    import torch
-
-    ds = actrm.Dataset(lift, {"action": range(8)}, split="valid")
-    plain = list(torch.utils.data.DataLoader(ds, batch_size=32))
-    loader = torch.utils.data.DataLoader(ds, batch_size=32, num_workers=2, multiprocessing_context=method)
-    for ours, theirs in zip(plain, loader, strict=True):
-        assert ours.keys() == theirs.keys()
-        assert torch.equal(ours["action"], theirs["action"]) and ours["task"] == theirs["task"]
-    batch = next(iter(ds.batches(32)))
-    shared = torch.from_numpy(batch["action"])
-    assert torch.equal(shared, plain[0]["action"])
-    shared[0] = 3
-    assert (batch["action"][0] == 3).all()
 
 
 def test_the_programs_are_there() -> None:

@@ -176,7 +176,8 @@ fn frames(dataset: &Dataset) -> Result<Vec<Series>, DatasetError> {
     let mut episode_index = Vec::with_capacity(total);
     let mut frame_index = Vec::with_capacity(total);
     let (stored, single) = dataset.frame_times()?.unzip();
-    let known = dataset.frame_tasks()?;
+    // frames whose task no table has are shown with their episode's
+    let known = dataset.frame_tasks().ok().flatten();
     let mut timestamp = stored.unwrap_or_default();
     let timed = !timestamp.is_empty();
     let mut task = Vec::with_capacity(total);

@@ -134,7 +134,9 @@ impl Collection {
         let (first_seed, expert, skill) = (record.first_seed, record.expert.clone(), record.skill);
         let collection = Self { folder: folder.to_owned(), first_seed, expert, skill, _lock: lock };
         match fs::read(&path) {
-            Ok(found) if record.is_of(&found) => {}
+            Ok(found) if found == text => {}
+            // of an older program, which did not tell as much
+            Ok(found) if record.is_of(&found) => write_atomic(&path, &text)?,
             // one that came to no attempt is in nobody's way
             Ok(found) if collection.count()? > 0 => return Err(differs(folder, &found, record)),
             Ok(_) => write_atomic(&path, &text)?,

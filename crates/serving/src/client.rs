@@ -101,6 +101,17 @@ impl Facts {
         server.open().map(|(_, facts)| facts).map_err(|failure| server.failed(failure))
     }
 
+    /// What is wrong where a server has become another one.
+    fn changed(&self, now: &Self) -> String {
+        let name = |facts: &Self| facts.entry.clone().unwrap_or_else(|| "a policy without a name".to_owned());
+        match (name(self), name(now)) {
+            (was, is) if was != is => {
+                format!("the server ran {was} before and runs {is} now; evaluate that under another name")
+            }
+            (was, _) => format!("the server now says other settings of {was}; run the evaluation again"),
+        }
+    }
+
     fn of(metadata: &Value<'_>) -> Result<Self> {
         let Value::Map(_) = metadata else {
             return Err(ServingError::message("message", "a map", metadata.to_string()));
@@ -234,6 +245,16 @@ impl RemotePolicy {
     }
 }
 
+impl RemotePolicy {
+    /// The same, of a server that still says of itself what it said before.
+    ///
+    /// # Errors
+    /// Another entry or other settings.
+    pub fn as_asked(self, before: &Facts) -> Result<Self> {
+        if self.server == *before { Ok(self) } else { Err(self.failed(before.changed(&self.server))) }
+    }
+}
+
 impl Address {
     fn failed(&self, failure: Failure) -> ServingError {
         let (Failure::Lost(detail) | Failure::Final(detail)) = failure;
@@ -361,7 +382,10 @@ impl RemotePolicy {
         if let Some(connection) = self.connection.take() {
             return Ok(connection);
         }
-        let (mut connection, _) = self.address.open()?;
+        let (mut connection, now) = self.address.open()?;
+        if now != self.server {
+            return Err(Failure::Final(self.server.changed(&now)));
+        }
         for query in &self.episode {
             self.address.exchange(&mut connection, query)?;
         }

@@ -22,7 +22,7 @@ pub struct Mapping {
     /// The task's name.
     #[serde(skip)]
     pub task: String,
-    /// Actions of a chunk that are executed before the next query [default: as the server says, or all].
+    /// Actions of a chunk that are executed before the next query [default: as the server says, or 1].
     pub n_action_steps: Option<usize>,
     /// Seconds that a query may take.
     pub timeout_s: u64,

@@ -354,11 +354,11 @@ impl Shared {
         let read = |number: &AtomicU64| number.load(Ordering::Relaxed);
         let milliseconds = read(&self.microseconds) as f64 / 1e3;
         format!(
-            "# HELP actrm_queries_total Observations received.\n# TYPE actrm_queries_total counter\n\
+            "# HELP actrm_queries_total Messages received: observations, and of vla-eval also the begin and end of episodes.\n# TYPE actrm_queries_total counter\n\
              actrm_queries_total {}\n\
              # HELP actrm_query_errors_total Messages answered with an error.\n# TYPE actrm_query_errors_total counter\n\
              actrm_query_errors_total {}\n\
-             # HELP actrm_query_milliseconds_total Time spent on observations.\n\
+             # HELP actrm_query_milliseconds_total Time spent on messages.\n\
              # TYPE actrm_query_milliseconds_total counter\nactrm_query_milliseconds_total {milliseconds}\n\
              # HELP actrm_clients Clients connected.\n# TYPE actrm_clients gauge\nactrm_clients {}\n",
             read(&self.queries),

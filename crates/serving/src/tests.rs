@@ -13,7 +13,7 @@ use models::{ActionChunk, FeatureSpec, ModelError, Observation, Policy, Signatur
 use tungstenite::stream::MaybeTlsStream;
 use tungstenite::{Message, WebSocket};
 
-use crate::client::RemotePolicy;
+use crate::client::{Facts, RemotePolicy};
 use crate::codec::{Array, Value, decode, encode};
 use crate::error::ServingError;
 use crate::mapping::Mapping;
@@ -342,6 +342,13 @@ fn a_lost_connection_is_made_again_at_the_same_place_of_the_episode() {
     remote.pause = Duration::from_millis(1);
     let error = remote.predict(&observation(1.0)).unwrap_err().to_string();
     assert!(error.contains(&url) && error.contains("tried 4 times"), "{error}");
+    // another server at its address
+    let other = Running::at(running.address.port(), 3, None, Limits::default());
+    let error = remote.predict(&observation(1.0)).unwrap_err().to_string();
+    assert!(error.contains("the server now says other settings of "), "{error}");
+    let again = RemotePolicy::connect(&other.url(), None, &signature(3), &Mapping::default()).unwrap();
+    let before = Facts::ask(&other.url(), None, &Mapping::default()).unwrap();
+    assert!(again.as_asked(&before).is_ok_and(|policy| policy.as_asked(&Facts::default()).is_err()));
 }
 
 /// A server that sends this metadata and then answers each message with the next of these, and then nothing more.

@@ -22,7 +22,10 @@ impl Work {
         let parents = Arc::new(Mutex::new(Some(cli::make_parent(out)?)));
         let (path, made) = (out.to_owned(), Arc::clone(&parents));
         stop.last_act(move || {
-            dataset::remove_unfinished(&path);
+            while !dataset::remove_unfinished(&path) {
+                // the result is there: the work says so and ends by itself
+                std::thread::park();
+            }
             remove(&made);
         });
         Ok(Self { stop, parents })

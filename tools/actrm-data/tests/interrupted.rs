@@ -94,6 +94,10 @@ fn ctrl_c_at_any_moment_leaves_all_or_nothing() {
             }
             let status = child.wait().unwrap();
             if out.exists() {
+                if out.is_dir() {
+                    let checks = dataset::verify(&out, &mut |_, _| {}).unwrap();
+                    assert!(checks.iter().all(|check| check.problem.is_none()), "{command}: {checks:?}");
+                }
                 assert_eq!(names(&parent), [out.file_name().unwrap().to_str().unwrap()], "{command}");
                 std::fs::remove_dir_all(&parent).unwrap();
             } else {

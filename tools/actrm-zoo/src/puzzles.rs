@@ -9,8 +9,8 @@ use puzzles::Task;
 use report::wilson_interval;
 use serde_json::{Value, json};
 use study::puzzle::{
-    EvaluatedPuzzles, Judge, MOST_VIEWS, PUZZLE_COLUMNS, PuzzleEvaluationOptions, SolverEntry, Starts, TEST_SEED,
-    evaluate_puzzles, evaluate_puzzles_again, is_solver,
+    DEPTH, EvaluatedPuzzles, Judge, MOST_VIEWS, PUZZLE_COLUMNS, PuzzleEvaluationOptions, SolverEntry, Starts,
+    TEST_SEED, evaluate_puzzles, evaluate_puzzles_again, is_solver,
 };
 use zoo::entry::Entry;
 use zoo::write_atomic;
@@ -22,7 +22,7 @@ pub struct PuzzleArgs {
     #[arg(long, value_name = "N", default_value_t = 600, value_parser = clap::value_parser!(u64).range(1..))]
     puzzles: u64,
     /// Largest number of supervision steps on a puzzle
-    #[arg(long, value_name = "N", default_value_t = 16, value_parser = clap::value_parser!(u64).range(1..=1000))]
+    #[arg(long, value_name = "N", default_value_t = DEPTH as u64, value_parser = clap::value_parser!(u64).range(1..=1000))]
     depth: u64,
     /// Givens of a Sudoku [default: the fewest that the solver was trained on]
     #[arg(long, value_name = "N")]

@@ -83,8 +83,7 @@ pub struct Served {
     address: String,
     token: Option<String>,
     mapping: Mapping,
-    /// What the server says that it runs.
-    pub declared: Option<String>,
+    facts: Facts,
 }
 
 impl Served {
@@ -114,7 +113,12 @@ impl Served {
         let now = conventions(&address, &facts, &mapping)?;
         external.conventions.check(&now, &address, &id.to_string(), &entry.meta().task)?;
         let token = token.map(str::to_owned);
-        Ok(Some(Self { external, address, token, mapping, declared: facts.entry }))
+        Ok(Some(Self { external, address, token, mapping, facts }))
+    }
+
+    /// What the server says that it runs.
+    pub fn declared(&self) -> Option<&str> {
+        self.facts.entry.as_deref()
     }
 
     /// What its owner declared of the weights when the row was measured.
@@ -125,17 +129,20 @@ impl Served {
     /// What is evaluated.
     pub fn subject(&self, entry: &Entry) -> Subject<'_> {
         let signature = entry.meta().signature.clone();
-        self.external.subject(entry, move || connect(&self.address, self.token.as_deref(), &signature, &self.mapping))
+        self.external.subject(entry, move || {
+            connect((&self.address, &self.facts), self.token.as_deref(), &signature, &self.mapping)
+        })
     }
 }
 
+/// A server's policy, if the server still says of itself what it said when it was asked.
 fn connect(
-    address: &str,
+    (address, facts): (&str, &Facts),
     token: Option<&str>,
     signature: &models::Signature,
     mapping: &Mapping,
 ) -> Result<Box<dyn Policy>, ModelError> {
-    let policy = RemotePolicy::connect(address, token, signature, mapping);
+    let policy = RemotePolicy::connect(address, token, signature, mapping).and_then(|policy| policy.as_asked(facts));
     policy.map(|policy| Box::new(policy) as Box<dyn Policy>).map_err(ModelError::from)
 }
 
@@ -234,7 +241,7 @@ impl Remote {
     }
 
     fn connect(&self, signature: &models::Signature) -> Result<Box<dyn Policy>, ModelError> {
-        connect(&self.address, self.token.as_deref(), signature, &self.mapping)
+        connect((&self.address, &self.facts), self.token.as_deref(), signature, &self.mapping)
     }
 }
 

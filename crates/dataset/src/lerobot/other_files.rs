@@ -6,7 +6,8 @@ use std::io;
 use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
 
-/// Their paths in the folder, sorted; of a folder that holds no part of the set its own alone.
+/// Their paths in the folder, sorted; of a folder that holds no part of the set its own alone. `images` counts as one: frames may
+/// name files in it, which edits put into the tables.
 pub(super) fn other_files(root: &Path) -> Result<Vec<PathBuf>> {
     let mut found = Vec::new();
     look(root, Path::new(""), &mut found)?;
@@ -20,17 +21,26 @@ fn look(root: &Path, below: &Path, found: &mut Vec<PathBuf>) -> Result<()> {
     for entry in std::fs::read_dir(&folder).map_err(failed)? {
         let entry = entry.map_err(failed)?;
         let path = below.join(entry.file_name());
-        let ends = |extension: &str| path.extension().is_some_and(|own| own == extension);
-        let names: Vec<_> = path.iter().filter_map(|name| name.to_str()).collect();
-        let (looked_into, part) = match names.as_slice() {
-            ["actrm" | "images"] => (false, true),
-            ["meta" | "data" | "videos"] => (true, true),
-            ["meta", "info.json" | "stats.json" | "tasks.parquet"] => (false, true),
-            ["meta", "episodes", ..] | ["data", ..] => (true, ends("parquet")),
-            ["videos", ..] => (true, ends("mp4")),
-            _ => (false, false),
+        // a name that is no text is none of ours
+        let names: Option<Vec<&str>> = path.iter().map(|name| name.to_str()).collect();
+        let part = match names.as_deref() {
+            Some(["actrm"] | ["meta", "info.json" | "stats.json" | "tasks.parquet"]) => true,
+            Some(["meta", "episodes", _, file] | ["data", _, file]) => file.ends_with(".parquet"),
+            Some(["videos", _, _, file]) => file.ends_with(".mp4"),
+            _ => false,
         };
-        if looked_into && entry.file_type().map_err(failed)?.is_dir() {
+        let looked_into = matches!(
+            names.as_deref(),
+            Some(
+                ["meta" | "data" | "videos"]
+                    | ["meta", "episodes"]
+                    | ["meta", "episodes", _]
+                    | ["data" | "videos", _]
+                    | ["videos", _, _]
+            )
+        );
+        // what a link names, too
+        if looked_into && std::fs::metadata(entry.path()).is_ok_and(|found| found.is_dir()) {
             look(root, &path, found)?;
         } else if !part {
             found.push(path);

@@ -8,9 +8,36 @@ use super::other_files;
 use super::work::in_order;
 use crate::error::{DatasetError, Result};
 use rustix::fs::{CWD, RenameFlags, renameat_with};
+use std::collections::BTreeMap;
 use std::fs::File;
 use std::io;
 use std::path::{Path, PathBuf};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+/// How the work of this process on a target ended.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum End {
+    /// It was given up: nothing gets the name any more.
+    GivenUp,
+    /// The target is there.
+    Published,
+}
+
+/// Held while a folder gets its name or is given up, so that never both happen.
+static ENDS: Mutex<BTreeMap<PathBuf, End>> = Mutex::new(BTreeMap::new());
+
+fn ends() -> MutexGuard<'static, BTreeMap<PathBuf, End>> {
+    ENDS.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// A target under one name, whether it is there or not.
+fn whole(target: &Path) -> PathBuf {
+    std::fs::canonicalize(target).unwrap_or_else(|_| {
+        let parent = parent_of(target);
+        let parent = std::fs::canonicalize(parent).unwrap_or_else(|_| parent.to_path_buf());
+        target.file_name().map_or(parent.clone(), |name| parent.join(name))
+    })
+}
 
 /// A folder under construction. Dropped before it is published, it removes itself.
 #[derive(Debug)]
@@ -81,16 +108,32 @@ impl Staging {
     }
 
     /// Flushes everything to disk and gives the folder its name. What is no part of the set that it replaces stays there.
+    ///
+    /// # Errors
+    /// [`DatasetError::Stopped`] after [`remove_unfinished`].
     pub(crate) fn publish(mut self) -> Result<()> {
         sync_tree(&self.path)?;
-        if self.replaces {
-            other_files::carry_over(&self.target, &self.path)?;
-            // at once: at no time is there neither of the two
-            renameat_with(CWD, &self.path, CWD, &self.target, RenameFlags::EXCHANGE)
-                .map_err(|errno| io_error(&self.target, "exchange it with what was written beside it")(errno.into()))?;
-            // dropped now, the hidden folder is the old one
-            return sync_parent(&self.target);
+        let target = whole(&self.target);
+        let mut ends = ends();
+        if ends.get(&target) == Some(&End::GivenUp) {
+            return Err(DatasetError::Stopped { path: self.target.clone() });
         }
+        match self.replaces {
+            true => self.exchange()?,
+            false => self.name()?,
+        }
+        ends.insert(target, End::Published);
+        sync_parent(&self.target)
+    }
+
+    fn exchange(&self) -> Result<()> {
+        other_files::carry_over(&self.target, &self.path)?;
+        // at once: at no time is there neither of the two; dropped then, the hidden folder is the old one
+        renameat_with(CWD, &self.path, CWD, &self.target, RenameFlags::EXCHANGE)
+            .map_err(|errno| io_error(&self.target, "exchange it with what was written beside it")(errno.into()))
+    }
+
+    fn name(&mut self) -> Result<()> {
         match renameat_with(CWD, &self.path, CWD, &self.target, RenameFlags::NOREPLACE) {
             Ok(()) => {}
             Err(rustix::io::Errno::EXIST) => {
@@ -107,7 +150,7 @@ impl Staging {
             }
         }
         self.published = true;
-        sync_parent(&self.target)
+        Ok(())
     }
 }
 
@@ -130,8 +173,17 @@ pub(super) fn own(prefix: &str) -> String {
     format!("{prefix}{}-", rustix::process::getpid().as_raw_nonzero())
 }
 
-/// Removes what this process has begun to write for the file or folder `out`: before it ends without unwinding.
-pub fn remove_unfinished(out: &Path) {
+/// Removes what this process has begun to write for the file or folder `out`, before it ends without unwinding; a data set does not
+/// appear there after that. `false` where one has appeared: the work is done but for its last words.
+pub fn remove_unfinished(out: &Path) -> bool {
+    {
+        let mut ends = ends();
+        let target = whole(out);
+        if ends.get(&target) == Some(&End::Published) {
+            return false;
+        }
+        ends.insert(target, End::GivenUp);
+    }
     crate::source::remove_unfinished(out);
     // what a link names is replaced
     let target = std::fs::canonicalize(out).unwrap_or_else(|_| out.to_path_buf());
@@ -151,6 +203,7 @@ pub fn remove_unfinished(out: &Path) {
             }
         }
     }
+    true
 }
 
 fn parent_of(target: &Path) -> &Path {
@@ -276,9 +329,9 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let (target, link) = (dir.path().join("set"), dir.path().join("link"));
         std::fs::create_dir(&target).unwrap();
-        std::fs::create_dir(target.join("data")).unwrap();
-        std::fs::write(target.join("data/x.parquet"), "old").unwrap();
-        for kept in ["README.md", "meta/more.json", ".git/refs/head", "data/notes.txt"] {
+        std::fs::create_dir_all(target.join("data/chunk-000")).unwrap();
+        std::fs::write(target.join("data/chunk-000/x.parquet"), "old").unwrap();
+        for kept in ["README.md", "meta/more.json", ".git/refs/head", "data/notes.txt", "data/extra.parquet"] {
             std::fs::create_dir_all(target.join(kept).parent().unwrap()).unwrap();
             std::fs::write(target.join(kept), kept).unwrap();
         }
@@ -286,13 +339,14 @@ mod tests {
         std::os::unix::fs::symlink(&target, &link).unwrap();
         drop(Staging::replacing(&target).unwrap());
         let staging = Staging::replacing(&link).unwrap();
-        std::fs::create_dir(staging.path().join("data")).unwrap();
-        std::fs::write(staging.path().join("data/y.parquet"), "new").unwrap();
-        assert_eq!(std::fs::read_to_string(target.join("data/x.parquet")).unwrap(), "old");
+        std::fs::create_dir_all(staging.path().join("data/chunk-000")).unwrap();
+        std::fs::write(staging.path().join("data/chunk-000/y.parquet"), "new").unwrap();
+        assert_eq!(std::fs::read_to_string(target.join("data/chunk-000/x.parquet")).unwrap(), "old");
         staging.publish().unwrap();
-        assert_eq!(names(&target.join("data")), ["notes.txt", "y.parquet"]);
+        assert_eq!(names(&target.join("data")), ["chunk-000", "extra.parquet", "notes.txt"]);
+        assert_eq!(names(&target.join("data/chunk-000")), ["y.parquet"]);
         // what is no part of a data set stays as it was
-        for kept in ["README.md", "meta/more.json", ".git/refs/head", "data/notes.txt"] {
+        for kept in ["README.md", "meta/more.json", ".git/refs/head", "data/notes.txt", "data/extra.parquet"] {
             assert_eq!(std::fs::read_to_string(target.join(kept)).unwrap(), kept);
         }
         assert_eq!(std::fs::read_link(target.join("LIESMICH")).unwrap(), Path::new("README.md"));
@@ -338,5 +392,29 @@ mod tests {
             }
         });
         assert!(names(dir.path()).is_empty());
+    }
+
+    #[test]
+    fn what_was_given_up_does_not_appear_and_what_has_appeared_is_not_removed() {
+        let dir = tempfile::tempdir().unwrap();
+        for replaces in [false, true] {
+            let target = dir.path().join(format!("set_{replaces}"));
+            let staging = || match replaces {
+                true => Staging::replacing(&target).unwrap(),
+                false => Staging::create(&target).unwrap(),
+            };
+            if replaces {
+                std::fs::create_dir(&target).unwrap();
+            }
+            let first = staging();
+            assert!(remove_unfinished(&target));
+            // as work that goes on a little
+            std::fs::create_dir_all(first.path()).unwrap();
+            assert!(matches!(first.publish(), Err(DatasetError::Stopped { .. })));
+            assert_eq!(target.exists(), replaces);
+            ends().remove(&whole(&target));
+            staging().publish().unwrap();
+            assert!(!remove_unfinished(&target) && target.exists());
+        }
     }
 }

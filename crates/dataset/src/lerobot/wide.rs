@@ -35,10 +35,10 @@ impl Wide {
             let column = BadColumn { path: &path, name };
             let leaf = read::leaf(&column, &arrays[0], arrays[0].len(), feature.dim())?;
             let wrong = |e: arrow_schema::ArrowError| column.because(feature.dtype.clone(), e.to_string());
-            let as_longs = read::cast_all(&leaf, &DataType::Int64);
+            let as_longs = whole.then(|| read::cast_all(&leaf, &DataType::Int64).ok()).flatten();
             match as_longs {
-                Ok(array) if whole => longs.extend_from_slice(array.as_primitive::<Int64Type>().values()),
-                _ => {
+                Some(array) => longs.extend_from_slice(array.as_primitive::<Int64Type>().values()),
+                None => {
                     whole = false;
                     doubles.extend(std::mem::take(&mut longs).into_iter().map(|v: i64| v as f64));
                     let array = read::cast_all(&leaf, &DataType::Float64).map_err(wrong)?;

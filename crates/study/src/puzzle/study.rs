@@ -16,7 +16,7 @@ use zoo::{ZooError, sha256_hex};
 
 use super::door::AnyExperiment;
 use super::entry::SolverEntry;
-use super::evaluation::{Judge, PuzzleEvaluation, PuzzleEvaluationOptions, Starts, TEST_SEED, evaluate_puzzles};
+use super::evaluation::{DEPTH, Judge, PuzzleEvaluation, PuzzleEvaluationOptions, Starts, TEST_SEED, evaluate_puzzles};
 use super::experiment::PuzzleExperiment;
 use super::training::{PuzzleTrainRequest, train_puzzles};
 
@@ -71,7 +71,7 @@ pub struct StudyRow {
 const PLAIN: StudyTest = StudyTest {
     task: None,
     givens: None,
-    depth: 16,
+    depth: DEPTH,
     seed: TEST_SEED,
     starts: Starts::ONE,
     views: 1,

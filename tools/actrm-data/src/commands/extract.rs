@@ -43,7 +43,9 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let _parents = cli::make_parent(&args.out)?;
     let stop = Stop::install("stopped; nothing was written")?;
     let out = args.out.clone();
-    stop.last_act(move || dataset::remove_unfinished(&out));
+    stop.last_act(move || {
+        dataset::remove_unfinished(&out);
+    });
     let mut spec = args.simulator.recorded_spec(&task, source.plan().env_args.as_ref())?;
     args.cameras.set(&mut spec);
     let Some(mut pool) = args.simulator.start(spec, None, &stop)? else {

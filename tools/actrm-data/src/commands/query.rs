@@ -37,7 +37,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let program = std::env::current_exe().context("cannot find this program")?.with_file_name(PROGRAM);
     if !program.is_file() {
         bail!(
-            "{}: expected the program that answers queries, found nothing (`make build` builds it)",
+            "{}: expected the program that answers queries, found nothing (`make build` in a clone builds it; the Python package comes without it)",
             program.display()
         );
     }

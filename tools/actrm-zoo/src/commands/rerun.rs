@@ -117,7 +117,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
 fn again(args: &Args, rerun: &Rerun, stop: &Stop, report: &mut Report) -> anyhow::Result<bool> {
     if let Some(served) = Served::of(rerun.entry(), args.policy.as_deref(), args.token.as_deref())? {
         report.skip_training("its weights are not in this zoo: its server acts");
-        rerun.compare_declared(served.declared_then(), served.declared.as_deref(), report);
+        rerun.compare_declared(served.declared_then(), served.declared(), report);
         let subject = rerun.as_measured(served.subject(rerun.entry()))?;
         return episodes(args, rerun, (rerun.entry(), &subject), stop, report);
     }

@@ -1,4 +1,3 @@
-use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
@@ -212,18 +211,22 @@ fn has_results(folder: &Path) -> bool {
     files.any(|file| file.is_ok_and(|file| file.path().extension().is_some_and(|name| name == "json")))
 }
 
-/// A line a cell: `k6-on-pickchain-200-seed1: chain (171 of 200), chain-2 (not run)`
+/// A line a training: `k6-on-pickchain-200-seed1: chain (171 of 200), chain-2 (not run)`. One that stands in several stages is in
+/// one line with the tests of all.
 fn listed(study: &Study, library: &Library) -> anyhow::Result<String> {
-    let mut text = String::new();
+    let mut lines: Vec<(String, Vec<String>)> = Vec::new();
     for cell in cells(study) {
         let results = stored_results(study, library, &cell)?;
         let tests = cell.tests.iter().zip(results).map(|(test, result)| match result {
             None => format!("{test} (not run)"),
             Some(result) => format!("{test} ({} of {})", won(&result), result.episodes.len()),
         });
-        let _ = writeln!(text, "{}: {}", cell.name(), tests.collect::<Vec<_>>().join(", "));
+        match lines.iter_mut().find(|(name, _)| *name == cell.name()) {
+            Some((_, known)) => known.extend(tests.filter(|test| !known.contains(test)).collect::<Vec<_>>()),
+            None => lines.push((cell.name(), tests.collect())),
+        }
     }
-    Ok(text)
+    Ok(lines.into_iter().map(|(name, tests)| format!("{name}: {}\n", tests.join(", "))).collect())
 }
 
 fn won(result: &CellResult) -> usize {

@@ -293,7 +293,8 @@ fn refuse_inside(inputs: &[Input], out: &Path) -> Result<()> {
 fn left_behind(inputs: &[Input]) -> Result<Option<String>> {
     let mut names = BTreeSet::new();
     for input in inputs {
-        names.extend(other_files(input.set.root())?.iter().map(|path| path.display().to_string()));
+        let others = other_files(input.set.root())?;
+        names.extend(others.iter().filter(|path| !path.starts_with("images")).map(|path| path.display().to_string()));
     }
     Ok((!names.is_empty()).then(|| format!("not copied: {}", list(names.iter().map(String::as_str)))))
 }

@@ -363,12 +363,14 @@ impl Tables {
         let wide = set.wide()?;
         let columns: Vec<String> = set.column_names().map(str::to_owned).collect();
         let finite: BTreeMap<&String, Vec<bool>> = columns.iter().map(|name| (name, finite(set, name))).collect();
-        let tolerance = |name: &String| if wide.contains_key(name) { WIDE_TOLERANCE } else { TOLERANCE };
-        for (name, computed) in set.exact_statistics_of(&all)?.into_iter().filter(|_| !set.stats().is_empty()) {
+        let ranges = set.ranges(&all)?;
+        for (name, single) in set.statistics_of(&all)?.into_iter().filter(|_| !set.stats().is_empty()) {
+            let dim = self.info.features.get(&name).map_or(1, Feature::dim);
+            let exact = wide.get(&name).and_then(|numbers| numbers.stats(&ranges, dim));
             match set.stats().get(&name) {
                 None => faults.push(Fault::new(Area::Statistics, FILE, &name, "statistics", "none")),
                 Some(stored) => {
-                    let found = differing(&computed, stored, &finite[&name], tolerance(&name));
+                    let found = wrong(exact.as_ref(), &single, stored, &finite[&name]);
                     faults.extend(found.map(|(what, expected, found)| {
                         Fault::new(Area::Statistics, FILE, &format!("{name}: {what}"), expected, found)
                     }));
@@ -395,21 +397,19 @@ impl Tables {
             let index = INDEX_COLUMNS.contains(&name.as_str());
             for (number, episode) in self.episodes.iter().enumerate().filter(|(_, e)| e.length > 0) {
                 let Some((at, stored)) = episode.row.and_then(|at| Some((at, stored.get(at)?))) else { continue };
-                let computed = match index {
+                let rows = (episode.first, episode.first + episode.length);
+                let exact = wide.get(name).and_then(|numbers| numbers.stats(&[rows], feature.dim()));
+                let single = match index {
                     true => self.expected(name, number).and_then(|values| values.stats(1)),
-                    false if wide.contains_key(name) => {
-                        wide[name].stats(&[(episode.first, episode.first + episode.length)], feature.dim())
-                    }
                     false => set.column(name).and_then(|column| {
                         let range = episode.first * column.dim..(episode.first + episode.length) * column.dim;
                         FeatureStats::of(column.data.get(range)?, column.dim)
                     }),
                 };
-                let Some(computed) = computed else { continue };
+                let Some(single) = single else { continue };
                 let usable = if index { vec![true] } else { finite.get(name).cloned().unwrap_or_default() };
-                let tolerance = tolerance(name);
                 let row = &self.rows[at];
-                faults.extend(differing(&computed, stored, &usable, tolerance).map(|(what, expected, found)| {
+                faults.extend(wrong(exact.as_ref(), &single, stored, &usable).map(|(what, expected, found)| {
                     let what = format!("stats/{name}/{what}");
                     Fault::new(Area::Statistics, &row.file, &what, expected, found).of(number, row.at)
                 }));
@@ -428,7 +428,7 @@ impl Tables {
                     let fault = Fault::new(Area::Statistics, FILE, name, "statistics", "none");
                     faults.push(Fault { repairable: is_looked_at(feature), ..fault });
                 }
-                Some(stored) => faults.extend(in_disorder(stored, &[], TOLERANCE).map(|(what, expected, found)| {
+                Some(stored) => faults.extend(in_disorder(stored, &[]).map(|(what, expected, found)| {
                     let fault = Fault::new(Area::Statistics, FILE, &format!("{name}: {what}"), expected, found);
                     Fault { repairable: is_looked_at(feature), ..fault }
                 })),
@@ -453,18 +453,36 @@ impl Tables {
     }
 }
 
+/// Shares of the largest value.
+#[derive(Clone, Copy)]
+struct Tolerance {
+    /// Of the smallest and the largest value, which nobody computes.
+    extremes: f64,
+    others: f64,
+}
+
 /// Difference up to which a stored statistic counts as right, as a share of the largest value: LeRobot adds in float32.
-const TOLERANCE: f64 = 1e-4;
+const TOLERANCE: Tolerance = Tolerance { extremes: 1e-4, others: 1e-4 };
 /// The same of numbers that float32 does not hold, which it adds in float64.
-const WIDE_TOLERANCE: f64 = 1e-10;
+const WIDE_TOLERANCE: Tolerance = Tolerance { extremes: 1e-10, others: 1e-10 };
+
+/// The same of statistics of doubles that were read as float32, as some of LeRobot's scripts do.
+const SINGLE_TOLERANCE: Tolerance = Tolerance { extremes: 1e-9, others: 1e-6 };
 
 /// A statistic, what belongs there and what was found.
 type Found = (&'static str, String, String);
 
 type Get = fn(&FeatureStats) -> &Vec<f64>;
 
+/// The first statistic that is wrong: of a column that float32 does not hold, one that is neither exact nor that of its float32.
+fn wrong(exact: Option<&FeatureStats>, single: &FeatureStats, stored: &FeatureStats, usable: &[bool]) -> Option<Found> {
+    let Some(exact) = exact else { return differing(single, stored, usable, TOLERANCE) };
+    let found = differing(exact, stored, usable, WIDE_TOLERANCE)?;
+    differing(single, stored, usable, SINGLE_TOLERANCE).map(|_| found)
+}
+
 /// The first statistic that differs, in the dimensions that are `usable`.
-fn differing(computed: &FeatureStats, stored: &FeatureStats, usable: &[bool], tolerance: f64) -> Option<Found> {
+fn differing(computed: &FeatureStats, stored: &FeatureStats, usable: &[bool], tolerance: Tolerance) -> Option<Found> {
     if stored.count != computed.count {
         return Some(("count", computed.count.to_string(), stored.count.to_string()));
     }
@@ -474,6 +492,7 @@ fn differing(computed: &FeatureStats, stored: &FeatureStats, usable: &[bool], to
         let (a, b) = (get(computed), get(stored));
         let close = |i: usize| {
             let scale = scale(computed, i);
+            let tolerance = if ["min", "max"].contains(&statistic) { tolerance.extremes } else { tolerance.others };
             // a variance is a difference of squares
             (a[i] - b[i]).abs() <= tolerance * scale
                 || statistic == "std" && (a[i].powi(2) - b[i].powi(2)).abs() <= tolerance * scale.powi(2)
@@ -483,7 +502,7 @@ fn differing(computed: &FeatureStats, stored: &FeatureStats, usable: &[bool], to
             return Some((statistic, format!("{a:?}"), format!("{b:?}")));
         }
     }
-    in_disorder(stored, usable, tolerance)
+    in_disorder(stored, usable)
 }
 
 /// The largest value of a dimension.
@@ -493,7 +512,7 @@ fn scale(stats: &FeatureStats, dimension: usize) -> f64 {
 }
 
 /// The first of the quantiles that is less than the one before it, or of another length. Old sets have none.
-fn in_disorder(stored: &FeatureStats, usable: &[bool], tolerance: f64) -> Option<Found> {
+fn in_disorder(stored: &FeatureStats, usable: &[bool]) -> Option<Found> {
     let vectors: [(&str, Get); 7] = [
         ("min", |s| &s.min),
         ("q01", |s| &s.q01),
@@ -511,7 +530,7 @@ fn in_disorder(stored: &FeatureStats, usable: &[bool], tolerance: f64) -> Option
             return Some((name, format!("{dim} numbers"), format!("{high:?}")));
         }
         // LeRobot counts quantiles in bins a little wider than the values
-        let rises = |i: usize| high[i] >= low[i] - tolerance.max(TOLERANCE) * scale(stored, i) - 1e-9;
+        let rises = |i: usize| high[i] >= low[i] - TOLERANCE.others * scale(stored, i) - 1e-9;
         if !(0..dim).all(|i| usable.get(i) == Some(&false) || rises(i)) {
             return Some((name, format!("no less than {low:?}"), format!("{high:?}")));
         }

@@ -16,7 +16,7 @@
 //! LeRobot nothing tells cameras apart.
 //!
 //! `pointer` (ours): a classification head over the entity tokens after the encoder, trained with cross-entropy on the entity that
-//! the demonstration took. The decoder also attends to the softmax-weighted mean of those tokens. `auxiliary` (ours): a regression
+//! the demonstration took. The decoder also attends to the softmax-weighted mean of those entities' input tokens. `auxiliary` (ours): a regression
 //! head on the first encoder token, trained on `data.auxiliary_keys`, which the policy does not observe.
 //!
 //! Shapes: b rows of a batch, C actions of a chunk (`action_horizon`), A dimensions of an action, L width of the latent, M tokens
