@@ -101,14 +101,14 @@ impl Facts {
         server.open().map(|(_, facts)| facts).map_err(|failure| server.failed(failure))
     }
 
-    /// What is wrong where a server has become another one.
+    /// The error of a server whose metadata changed.
     fn changed(&self, now: &Self) -> String {
         let name = |facts: &Self| facts.entry.clone().unwrap_or_else(|| "a policy without a name".to_owned());
         match (name(self), name(now)) {
             (was, is) if was != is => {
-                format!("the server ran {was} before and runs {is} now; evaluate that under another name")
+                format!("the server now runs {is}, expected {was}; evaluate it under another name")
             }
-            (was, _) => format!("the server now says other settings of {was}; run the evaluation again"),
+            (was, _) => format!("the server reports other metadata for {was} than before; run the evaluation again"),
         }
     }
 
@@ -246,7 +246,7 @@ impl RemotePolicy {
 }
 
 impl RemotePolicy {
-    /// The same, of a server that still says of itself what it said before.
+    /// The same policy, if the server reports the same metadata as before.
     ///
     /// # Errors
     /// Another entry or other settings.

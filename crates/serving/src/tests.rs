@@ -345,7 +345,7 @@ fn a_lost_connection_is_made_again_at_the_same_place_of_the_episode() {
     // another server at its address
     let other = Running::at(running.address.port(), 3, None, Limits::default());
     let error = remote.predict(&observation(1.0)).unwrap_err().to_string();
-    assert!(error.contains("the server now says other settings of "), "{error}");
+    assert!(error.contains("the server reports other metadata for "), "{error}");
     let again = RemotePolicy::connect(&other.url(), None, &signature(3), &Mapping::default()).unwrap();
     let before = Facts::ask(&other.url(), None, &Mapping::default()).unwrap();
     assert!(again.as_asked(&before).is_ok_and(|policy| policy.as_asked(&Facts::default()).is_err()));

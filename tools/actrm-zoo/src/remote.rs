@@ -135,7 +135,7 @@ impl Served {
     }
 }
 
-/// A server's policy, if the server still says of itself what it said when it was asked.
+/// A server's policy, if the server reports the same metadata as when it was asked.
 fn connect(
     (address, facts): (&str, &Facts),
     token: Option<&str>,
