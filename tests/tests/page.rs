@@ -285,8 +285,15 @@ fn the_page_of_a_data_set_says_what_is_in_it() {
     let at = |name: &str| folder.path().join(name);
     let films = films();
     viewed(folder.path());
-    let words = ["films.html: exists already"];
-    refused(&mut data(["view", text(&films), "--out", text(&at("films.html"))]), &words);
+    // a page of the command is replaced, another file is not
+    let first = fs::read(at("films.html")).expect("a page");
+    succeeds(&mut data(["view", text(&films), "--out", text(&at("films.html"))]));
+    assert_ne!(fs::read(at("films.html")).expect("a page"), first);
+    fs::write(at("own.html"), "<!doctype html>\n<p>mine</p>\n").expect("writable");
+    let words = ["own.html: exists already and is no page of this command"];
+    refused(&mut data(["view", text(&films), "--out", text(&at("own.html"))]), &words);
+    assert_eq!(fs::read_to_string(at("own.html")).expect("there"), "<!doctype html>\n<p>mine</p>\n");
+    fs::remove_file(at("own.html")).expect("removable");
     let mut asked = data(["view", text(&films), "--column", "reward", "--out"]);
     refused(asked.arg(at("x.html")), &["no column reward; there is action, observation.state"]);
     assert_eq!(listing(folder.path()), ["file.html", "films.html"]);

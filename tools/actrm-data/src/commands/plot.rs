@@ -135,10 +135,15 @@ fn page(set: &Dataset, episode: &EpisodeMeta, columns: &[&str], heading: &str) -
 }
 
 /// Writes a new file under a temporary name first.
-pub(super) fn create(path: &Path, bytes: &[u8]) -> Result<()> {
+fn create(path: &Path, bytes: &[u8]) -> Result<()> {
     if path.exists() {
         bail!("{}: exists already; choose another path or remove it first", path.display());
     }
+    write(path, bytes)
+}
+
+/// Writes a file under a temporary name first. A file of that name is replaced.
+pub(super) fn write(path: &Path, bytes: &[u8]) -> Result<()> {
     let _parents = cli::make_parent(path)?;
     let parent = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let mut name = OsString::from(".");

@@ -1,7 +1,9 @@
 use super::inspect;
-use crate::view::{Head, Opened, Page};
+use crate::view::{BEGINNING, Head, Opened, Page};
 use anyhow::{Result, bail};
-use std::path::PathBuf;
+use std::fs::File;
+use std::io::Read;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 /// Make one HTML page of a data set or a file of demonstrations, which needs no network.
@@ -19,7 +21,7 @@ use std::process::ExitCode;
 pub struct Args {
     /// Data set directory, HDF5 file, or folder with one file an episode
     set: PathBuf,
-    /// File to create
+    /// File to create; a page that this command made is replaced, another file is not
     #[arg(long, short, default_value = "view.html")]
     out: PathBuf,
     /// Images of each camera in an episode, evenly spread; 0 for none
@@ -40,8 +42,11 @@ pub struct Args {
 }
 
 pub fn run(args: &Args) -> Result<ExitCode> {
-    if args.out.exists() {
-        bail!("{}: exists already; choose another path or remove it first", args.out.display());
+    if args.out.exists() && !is_page(&args.out) {
+        bail!(
+            "{}: exists already and is no page of this command; choose another path or remove it first",
+            args.out.display()
+        );
     }
     let opened = Opened::open(&args.set)?;
     let mut columns = opened.columns();
@@ -80,10 +85,17 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     }
     screen.clear();
     let html = page.html(&head);
-    super::plot::create(&args.out, html.as_bytes())?;
+    super::plot::write(&args.out, html.as_bytes())?;
     let size = cli::bytes(html.len() as u64);
     cli::print(&format!("{}: {} episodes, {size}\n", args.out.display(), cli::count(opened.episodes())))?;
     Ok(ExitCode::SUCCESS)
+}
+
+/// Whether a file is a page that this command made.
+fn is_page(path: &Path) -> bool {
+    let mut beginning = Vec::new();
+    let read = File::open(path).and_then(|file| file.take(BEGINNING.len() as u64).read_to_end(&mut beginning));
+    read.is_ok() && beginning == BEGINNING.as_bytes()
 }
 
 /// What `inspect` says, and what `validate` finds.

@@ -12,6 +12,10 @@ use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use std::fmt::Write as _;
 
+/// What every page begins with, by which it is known again.
+pub const BEGINNING: &str =
+    "<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n<meta name=\"generator\" content=\"actrm-data view\">\n";
+
 /// What the page says above its episodes.
 #[derive(Default)]
 pub struct Head {
@@ -135,9 +139,9 @@ impl Page {
                 self.points
             ));
         }
-        let mut html = String::from(
-            "<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
-             <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n<link rel=\"icon\" href=\"data:,\">\n",
+        let mut html = String::from(BEGINNING);
+        html.push_str(
+            "<meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n<link rel=\"icon\" href=\"data:,\">\n",
         );
         let title = escape(&head.title);
         let style = [include_str!("../../../../crates/report/src/style.css"), include_str!("page.css")].concat();
