@@ -128,7 +128,7 @@ zoo: build ## every policy on every robot task, three trainings each, and the le
 
 .PHONY: study-recursion
 study-recursion: build ## does recursion help: the studies of robot policies, as far as they have not been run (days)
-	@for study in recursion towers fewer_demonstrations; do RAYON_NUM_THREADS=1 target/release/actrm-zoo study studies/$$study.toml --jobs $(or $(JOBS),2); done
+	@for study in recursion towers; do RAYON_NUM_THREADS=1 target/release/actrm-zoo study studies/$$study.toml --jobs $(or $(JOBS),2); done
 
 .PHONY: check
 check: build ## the tests of one change, in five minutes: unit tests, the rules of the house, the whole line once

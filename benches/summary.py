@@ -1,6 +1,6 @@
 """All rows of a run of the benchmarks in one table, from what each wrote to target/bench.
 
-    .venv/bin/python benches/summary.py puzzles=0 data=0 control=1
+    .venv/bin/python benches/summary.py data=0 act=0 control=1
 
 A word a benchmark: its name and the exit code it ended with. Exit code 1 where a bar is missed or a benchmark failed.
 """
@@ -45,11 +45,6 @@ def verdict(row: dict[str, Any], met: bool | None) -> str:
 def line(row: dict[str, Any]) -> Line:
     """A row in the form of whichever benchmark wrote it."""
     unit = row.get("unit", "")
-    if "per_second" in row:  # puzzles: no peer
-        bar = row["bar"]
-        met = None if bar is None else row["per_second"] >= bar
-        shown = "none" if bar is None else f">= {number(bar)}"
-        return Line(f"{row['work']}, a second", number(row["per_second"]), "-", "-", shown, verdict(row, met))
     if "ours_s" in row:  # trm: seconds, and the ratio is ours by theirs
         met = None if row["ratio"] is None else row["ratio"] <= row["bar"]
         ours, peer = (number(row[key] and 1e3 * row[key]) for key in ("ours_s", "peer_s"))

@@ -6,7 +6,7 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 export ACTRM_PEER_PYTHON="$PWD/.venv-peers/bin/python"
 examples=target/release/examples
-names=(puzzles data act policies trm control evaluation vision python external report)
+names=(data act policies trm control evaluation vision python external report)
 
 for name in "${@:-}"; do
     if [[ -n $name && " ${names[*]} " != *" $name "* ]]; then
@@ -30,7 +30,7 @@ for name in ${*:-${names[*]}}; do
         done
     fi
     case $name in
-    puzzles | data | report) "$examples/bench_$name" || code=$? ;;
+    data | report) "$examples/bench_$name" || code=$? ;;
     act | trm | vision) "$examples/bench_$name" --peer "$ACTRM_PEER_PYTHON" || code=$? ;;
     policies) RAYON_NUM_THREADS=1 "$examples/bench_policies" --peer "$ACTRM_PEER_PYTHON" || code=$? ;;
     control | evaluation) .venv/bin/python "benches/$name.py" || code=$? ;;

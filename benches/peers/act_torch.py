@@ -1,20 +1,14 @@
-"""LeRobot's ACT on PyTorch, driven step by step: one line of JSON in, one out.
+"""LeRobot's ACT on PyTorch, driven step by step (`orders.py`).
 
 Lines: {"work": "train" | "predict" | "plan", "size": "d256" | "d512", "threads": 1, "times": 3}
 "plan" predicts as the original ACTRM does: the encoder is a recursion of 336 calls, the rest is ACT's.
-Answers: {"wall": seconds, "cpu": seconds} for one of the `times` repetitions (their mean),
-and {"peak": bytes} for "memory": the most that this process has had in memory so far.
 """
-
-import json
-import sys
-import time
-from pathlib import Path
 
 import torch
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.act.modeling_act import ACTPolicy
+from orders import Work, answer
 
 SIZES = {
     "d128": {"dim_model": 128, "dim_feedforward": 512, "chunk_size": 16},
@@ -57,7 +51,6 @@ class Recursion(torch.nn.Module):
 
 class Peer:
     def __init__(self, size: str) -> None:
-        torch.manual_seed(0)
         self.policy = policy(size)
         self.optimiser = torch.optim.AdamW(self.policy.parameters(), lr=1e-4, weight_decay=1e-4)
         chunk = SIZES[size]["chunk_size"]
@@ -92,32 +85,10 @@ class Peer:
             model.encoder = encoder
 
 
-def peak_memory() -> int:
-    """In bytes, of this process alone (`ru_maxrss` would begin with the parent's)."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return 1024 * next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:"))
-
-
-def main() -> None:
-    peers: dict[str, Peer] = {}
-    print(json.dumps({"torch": torch.__version__}), flush=True)
-    for line in sys.stdin:
-        order = json.loads(line)
-        if order["work"] == "memory":
-            print(json.dumps({"peak": peak_memory()}), flush=True)
-            continue
-        torch.set_num_threads(order["threads"])
-        if order["size"] not in peers:
-            peers[order["size"]] = Peer(order["size"])
-        peer = peers[order["size"]]
-        run = {"train": peer.train, "predict": peer.predict, "plan": peer.plan}[order["work"]]
-        wall, cpu = time.perf_counter(), time.process_time()
-        for _ in range(order["times"]):
-            run()
-        times = order["times"]
-        answer = {"wall": (time.perf_counter() - wall) / times, "cpu": (time.process_time() - cpu) / times}
-        print(json.dumps(answer), flush=True)
+def works(size: str) -> Work:
+    peer = Peer(size)
+    return {"train": peer.train, "predict": peer.predict, "plan": peer.plan}
 
 
 if __name__ == "__main__":
-    main()
+    answer(works)

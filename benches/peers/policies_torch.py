@@ -1,14 +1,9 @@
-"""LeRobot's diffusion, robomimic's BC-RNN and BC-Transformer on PyTorch, step by step: one line of JSON in, one out.
+"""LeRobot's diffusion, robomimic's BC-RNN and BC-Transformer on PyTorch, driven step by step (`orders.py`).
 
 Lines: {"policy": "diffusion" | "bc_rnn" | "bc_transformer", "work": "train" | "predict", "times": 3}, on one thread.
 "predict" draws actions from one observation: diffusion with 10 steps of DDIM, BC-RNN and BC-Transformer one action.
-Answers: {"wall": seconds, "cpu": seconds} for one of the `times` repetitions (their mean).
 """
 
-import json
-import os
-import sys
-import time
 from collections import OrderedDict
 from collections.abc import Callable
 from typing import Any
@@ -18,6 +13,7 @@ import torch
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
+from orders import Work, answer
 from robomimic.models.policy_nets import RNNGMMActorNetwork, TransformerGMMActorNetwork
 
 BATCH, STATE, ENV, ACTION, STEPS = 64, 9, 10, 7, 10
@@ -25,7 +21,6 @@ BATCH, STATE, ENV, ACTION, STEPS = 64, 9, 10, 7, 10
 PLAIN: dict[str, Any] = {
     "low_dim": {"core_class": None, "core_kwargs": {}, "obs_randomizer_class": None, "obs_randomizer_kwargs": {}}
 }
-Work = dict[str, Callable[[], None]]
 
 
 def trained(module: torch.nn.Module, loss: Callable[[], torch.Tensor]) -> Callable[[], None]:
@@ -136,30 +131,12 @@ def bc_transformer() -> Work:
     }
 
 
-def main() -> None:
-    # robomimic prints what it builds: the channel is for answers alone
-    channel = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)
-    torch.set_num_threads(1)
-    obs_utils.initialize_obs_utils_with_obs_specs(
-        {"obs": {"low_dim": ["state", "env"], "rgb": [], "depth": [], "scan": []}}
-    )
-    made: dict[str, Work] = {}
-    make = {"diffusion": diffusion, "bc_rnn": bc_rnn, "bc_transformer": bc_transformer}
-    print(json.dumps({"torch": torch.__version__}), file=channel, flush=True)
-    for line in sys.stdin:
-        order = json.loads(line)
-        if order["policy"] not in made:
-            torch.manual_seed(0)
-            made[order["policy"]] = make[order["policy"]]()
-        run = made[order["policy"]][order["work"]]
-        wall, cpu = time.perf_counter(), time.process_time()
-        for _ in range(order["times"]):
-            run()
-        times = order["times"]
-        answer = {"wall": (time.perf_counter() - wall) / times, "cpu": (time.process_time() - cpu) / times}
-        print(json.dumps(answer), file=channel, flush=True)
+def works(policy: str) -> Work:
+    return {"diffusion": diffusion, "bc_rnn": bc_rnn, "bc_transformer": bc_transformer}[policy]()
 
 
 if __name__ == "__main__":
-    main()
+    obs_utils.initialize_obs_utils_with_obs_specs(
+        {"obs": {"low_dim": ["state", "env"], "rgb": [], "depth": [], "scan": []}}
+    )
+    answer(works)

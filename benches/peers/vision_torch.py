@@ -1,16 +1,10 @@
-"""LeRobot's ACT with two cameras on PyTorch, driven step by step: one line of JSON in, one out.
+"""LeRobot's ACT with two cameras on PyTorch, driven step by step (`orders.py`).
 
 Lines: {"work": "train" | "predict", "size": "d256", "batch": 8, "threads": 1, "times": 3}
 Sizes: "d512" (LeRobot's defaults), "d256", both on torchvision's ResNet18 with frozen norm, and "narrow": width 128,
 and a ResNet18 of 16 channels with GroupNorm, which LeRobot takes by its name in torchvision.
-Answers: {"wall": seconds, "cpu": seconds} for one of the `times` repetitions (their mean),
-and {"peak": bytes, "import": bytes} for "memory": the most that this process has had so far, and after importing torch.
 """
 
-import json
-import sys
-import time
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -18,6 +12,7 @@ import torchvision
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.act.modeling_act import ACTPolicy
+from orders import Work, answer
 from torchvision.models.resnet import BasicBlock, ResNet
 
 SIZES = {
@@ -63,7 +58,6 @@ def policy(size: str) -> ACTPolicy:
 
 class Peer:
     def __init__(self, size: str, batch: int) -> None:
-        torch.manual_seed(0)
         self.policy = policy(size)
         self.optimiser = torch.optim.AdamW(self.policy.get_optim_params(), lr=1e-4, weight_decay=1e-4)
         chunk = SIZES[size]["chunk_size"]
@@ -89,33 +83,10 @@ class Peer:
             self.policy.predict_action_chunk(self.one)
 
 
-def memory(key: str) -> int:
-    """In bytes, of this process alone (`ru_maxrss` would begin with the parent's)."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return 1024 * next(int(line.split()[1]) for line in lines if line.startswith(key))
-
-
-def main() -> None:
-    peers: dict[tuple[str, int], Peer] = {}
-    imported = memory("VmHWM:")
-    print(json.dumps({"torch": torch.__version__}), flush=True)
-    for line in sys.stdin:
-        order = json.loads(line)
-        if order["work"] == "memory":
-            print(json.dumps({"peak": memory("VmHWM:"), "import": imported}), flush=True)
-            continue
-        torch.set_num_threads(order["threads"])
-        key = (order["size"], order["batch"])
-        if key not in peers:
-            peers[key] = Peer(*key)
-        run = {"train": peers[key].train, "predict": peers[key].predict}[order["work"]]
-        wall, cpu = time.perf_counter(), time.process_time()
-        for _ in range(order["times"]):
-            run()
-        times = order["times"]
-        answer = {"wall": (time.perf_counter() - wall) / times, "cpu": (time.process_time() - cpu) / times}
-        print(json.dumps(answer), flush=True)
+def works(size: str, batch: int) -> Work:
+    peer = Peer(size, batch)
+    return {"train": peer.train, "predict": peer.predict}
 
 
 if __name__ == "__main__":
-    main()
+    answer(works)

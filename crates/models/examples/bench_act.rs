@@ -8,14 +8,14 @@
 //! and on ours), and the same model on candle's autograd.
 #![allow(clippy::unwrap_used)]
 
+mod beside;
+
+use beside::{Bench, Cost, in_own_process, option, peak_memory, timed};
 use models::actrm::{Actrm, Over, ReasoningConfig};
 use models::{
     Backend, Batch, Features, LossParts, PolicyConfig, PolicyModel, Rng, Signature, TrainConfig, Trainer, act, actrm,
 };
 use serde_json::json;
-use std::io::{BufRead, BufReader, Write};
-use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
-use std::time::Instant;
 
 const BATCH: usize = 64;
 /// Predictions of one measurement: a few tenths of a second, as the system counts CPU time in steps of milliseconds.
@@ -79,125 +79,7 @@ fn trainer(config: &PolicyConfig, threads: usize) -> Trainer {
     trainer
 }
 
-/// Seconds.
-#[derive(Clone, Copy)]
-struct Cost {
-    wall: f64,
-    cpu: f64,
-}
-
-/// CPU time of this thread; counted in steps of the scheduler, some milliseconds.
-fn thread_cpu() -> f64 {
-    let text = std::fs::read_to_string("/proc/thread-self/schedstat").unwrap();
-    text.split_whitespace().next().unwrap().parse::<f64>().unwrap() / 1e9
-}
-
-/// One measurement of work that runs on this thread (its CPU time would lack other threads').
-fn timed(times: usize, work: &mut dyn FnMut()) -> Cost {
-    let (wall, cpu) = (Instant::now(), thread_cpu());
-    (0..times).for_each(|_| work());
-    Cost { wall: wall.elapsed().as_secs_f64() / times as f64, cpu: (thread_cpu() - cpu) / times as f64 }
-}
-
-struct Peer {
-    child: Child,
-    orders: ChildStdin,
-    answers: BufReader<ChildStdout>,
-}
-
-impl Peer {
-    fn start(python: &str) -> Self {
-        let script = concat!(env!("CARGO_MANIFEST_DIR"), "/../../benches/peers/act_torch.py");
-        let mut command = Command::new(python);
-        let mut child = command.arg(script).stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
-        let (orders, answers) = (child.stdin.take().unwrap(), BufReader::new(child.stdout.take().unwrap()));
-        let mut peer = Self { child, orders, answers };
-        peer.read();
-        peer
-    }
-
-    fn read(&mut self) -> serde_json::Value {
-        let mut line = String::new();
-        self.answers.read_line(&mut line).unwrap();
-        serde_json::from_str(&line).expect("the peer answers in JSON")
-    }
-
-    fn ask(&mut self, work: &str, size: &str, threads: usize, times: usize) -> serde_json::Value {
-        let order = json!({ "work": work, "size": size, "threads": threads, "times": times });
-        writeln!(self.orders, "{order}").unwrap();
-        self.read()
-    }
-
-    fn timed(&mut self, work: &str, size: &str, threads: usize, times: usize) -> Cost {
-        let answer = self.ask(work, size, threads, times);
-        Cost { wall: answer["wall"].as_f64().unwrap(), cpu: answer["cpu"].as_f64().unwrap() }
-    }
-
-    fn end(self) {
-        let Self { mut child, orders, .. } = self;
-        drop(orders);
-        child.wait().unwrap();
-    }
-}
-
-struct Bench {
-    python: Option<String>,
-    rounds: usize,
-    only: String,
-    rows: Vec<serde_json::Value>,
-}
-
 impl Bench {
-    fn wants(&self, name: &str) -> bool {
-        name.contains(&self.only)
-    }
-
-    /// Both sides in turns, after one run of each to warm up.
-    fn in_turns(
-        &mut self,
-        name: &str,
-        bar: Option<f64>,
-        by_wall: bool,
-        mut ours: impl FnMut() -> Cost,
-        mut theirs: Option<impl FnMut() -> Cost>,
-    ) {
-        let mut costs = [Vec::new(), Vec::new()];
-        for round in 0..=self.rounds {
-            let pair = [Some(ours()), theirs.as_mut().map(|theirs| theirs())];
-            for (all, cost) in costs.iter_mut().zip(pair).filter(|_| round > 0) {
-                all.extend(cost);
-            }
-        }
-        let pick = |costs: &[Cost]| {
-            let mut values: Vec<f64> = costs.iter().map(|c| if by_wall { c.wall } else { c.cpu }).collect();
-            values.sort_by(f64::total_cmp);
-            values.get(if by_wall { values.len() / 2 } else { 0 }).map(|s| s * 1e3)
-        };
-        let name = format!("{name}, {}", if by_wall { "wall" } else { "CPU" });
-        self.row(&name, "ms", pick(&costs[0]).unwrap(), pick(&costs[1]), bar);
-    }
-
-    fn row(&mut self, work: &str, unit: &str, ours: f64, peer: Option<f64>, bar: Option<f64>) {
-        let ratio = peer.map(|peer| ours / peer);
-        let met = ratio.zip(bar).map(|(ratio, bar)| ratio <= bar);
-        let verdict = match met {
-            Some(true) => "met",
-            Some(false) => "MISSED",
-            None => "",
-        };
-        let show = |value: Option<f64>, digits: usize| value.map_or("-".to_string(), |v| format!("{v:.digits$}"));
-        println!(
-            "{work:<72} {:>10} {:>10} {unit:<4} {:>7} {:>5} {verdict}",
-            show(Some(ours), 2),
-            show(peer, 2),
-            show(ratio, 4),
-            show(bar, 2)
-        );
-        self.rows.push(json!({
-            "work": work, "unit": unit, "ours": ours, "peer": peer, "ratio": ratio, "bar": bar, "met": met,
-        }));
-    }
-
     /// ACT beside LeRobot's.
     fn act(&mut self, size: &str, train_bar: f64) {
         for threads in [1, 2] {
@@ -206,19 +88,19 @@ impl Bench {
                 continue;
             }
             let (batch, mut trainer) = (batch(size), trainer(&act_config(size), threads));
-            let mut peer = self.python.as_deref().map(Peer::start);
-            let theirs = peer.as_mut().map(|peer| || peer.timed("train", size, threads, 1));
+            let order = json!({ "work": "train", "size": size, "threads": threads, "times": 1 });
+            let mut peer = self.peer();
+            let theirs = peer.as_mut().map(|peer| || peer.timed(&order));
             let ours = || timed(1, &mut || drop(trainer.step(&batch).unwrap()));
             self.in_turns(&name, Some(train_bar), threads > 1, ours, theirs);
-            peer.into_iter().for_each(Peer::end);
         }
         let name = format!("ACT predict {size}, batch 1");
         if self.wants(&name) {
             let model = act_config(size).build(&signature(), 1, &Backend::CPU).unwrap();
-            let mut peer = self.python.as_deref().map(Peer::start);
-            let theirs = peer.as_mut().map(|peer| || peer.timed("predict", size, 1, repeats(size)));
+            let order = json!({ "work": "predict", "size": size, "threads": 1, "times": repeats(size) });
+            let mut peer = self.peer();
+            let theirs = peer.as_mut().map(|peer| || peer.timed(&order));
             self.in_turns(&name, Some(0.6), false, || predictions(model.as_ref(), size, repeats(size)), theirs);
-            peer.into_iter().for_each(Peer::end);
         }
     }
 
@@ -233,10 +115,10 @@ impl Bench {
         }
         let name = format!("ACTRM predict {size} (peer: {ORIGINAL_CALLS} calls of LeRobot's encoder)");
         if self.wants(&name) {
-            let mut peer = self.python.as_deref().map(Peer::start);
-            let theirs = peer.as_mut().map(|peer| || peer.timed("plan", size, 1, 1));
+            let order = json!({ "work": "plan", "size": size, "threads": 1, "times": 1 });
+            let mut peer = self.peer();
+            let theirs = peer.as_mut().map(|peer| || peer.timed(&order));
             self.in_turns(&name, Some(0.01), false, || predictions(ours.as_ref(), size, repeats(size)), theirs);
-            peer.into_iter().for_each(Peer::end);
         }
         // on our own layers the plan is as fast as it can be made: what remains is what the design saves
         let name = format!("ACTRM predict {size} (peer: {ORIGINAL_CALLS} calls of our encoder)");
@@ -286,15 +168,10 @@ impl Bench {
         if !self.wants(&name) {
             return;
         }
-        let me = std::env::current_exe().unwrap();
-        let output = Command::new(me).args(["--memory-of", size]).output().unwrap();
-        let ours: f64 = String::from_utf8(output.stdout).unwrap().trim().parse().unwrap();
-        let theirs = self.python.as_deref().map(|python| {
-            let mut peer = Peer::start(python);
-            peer.ask("train", size, 2, 2);
-            let peak = peer.ask("memory", size, 2, 1)["peak"].as_f64().unwrap();
-            peer.end();
-            peak
+        let ours = in_own_process(&["--memory-of", size]);
+        let theirs = self.peer().map(|mut peer| {
+            peer.ask(&json!({ "work": "train", "size": size, "threads": 2, "times": 2 }));
+            peer.ask(&json!({ "work": "memory" }))["peak"].as_f64().unwrap()
         });
         self.row(&name, "MB", ours / 1e6, theirs.map(|peak| peak / 1e6), Some(1.0));
     }
@@ -306,26 +183,14 @@ fn predictions(model: &dyn PolicyModel, size: &str, times: usize) -> Cost {
     timed(times, &mut || drop(model.predict(&one).unwrap()))
 }
 
-/// Bytes that this process had in memory at its fullest.
-fn peak_memory() -> f64 {
-    let status = std::fs::read_to_string("/proc/self/status").unwrap();
-    let line = status.lines().find(|line| line.starts_with("VmHWM:")).unwrap();
-    line.split_whitespace().nth(1).unwrap().parse::<f64>().unwrap() * 1024.0
-}
-
 fn main() {
-    let args: Vec<String> = std::env::args().collect();
-    let option = |name: &str| args.iter().position(|a| a == name).and_then(|i| args.get(i + 1).cloned());
     if let Some(size) = option("--memory-of") {
         let (batch, mut trainer) = (batch(&size), trainer(&act_config(&size), 2));
         (0..2).for_each(|_| drop(trainer.step(&batch).unwrap()));
         println!("{}", peak_memory());
         return;
     }
-    let rounds = option("--rounds").map_or(5, |n| n.parse().expect("--rounds takes a number"));
-    let only = option("--only").unwrap_or_default();
-    let mut bench = Bench { python: option("--peer"), rounds, only, rows: Vec::new() };
-    println!("{:<72} {:>10} {:>10} {:<4} {:>7} {:>5}", "work", "ours", "peer", "", "ratio", "bar");
+    let mut bench = Bench::new("act_torch.py", 5);
     bench.act("d256", 1.0);
     for size in ["d128", "d256", "d512"] {
         bench.actrm(size);
@@ -337,10 +202,8 @@ fn main() {
     bench.actrm_training("d128", memory);
     bench.memory("d256");
     // slow: fewer rounds keep the whole within minutes
-    bench.rounds = rounds.min(3);
+    bench.rounds = bench.rounds.min(3);
     bench.act("d512", 1.1);
     bench.memory("d512");
-    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../target/bench");
-    std::fs::create_dir_all(folder).unwrap();
-    std::fs::write(format!("{folder}/act.json"), serde_json::to_string_pretty(&bench.rows).unwrap()).unwrap();
+    bench.write("act");
 }

@@ -6,15 +6,15 @@
 //! bytes on our side and as normalised floats on theirs. Without `--peer` only ours is timed.
 #![allow(clippy::unwrap_used)]
 
+mod beside;
+
+use beside::{Bench, in_own_process, option, peak_memory, timed};
 use models::encoders::{ImageNorm, VisionConfig};
 use models::{
     Backend, Batch, FeatureSpec, Features, NormMode, Normaliser, PolicyConfig, PolicyModel, Preprocess, Rng, Signature,
     TrainConfig, Trainer, ValuesRef, act,
 };
 use serde_json::json;
-use std::io::{BufRead, BufReader, Write};
-use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
-use std::time::Instant;
 
 const CAMERAS: [&str; 2] = ["observation.images.agentview", "observation.images.robot0_eye_in_hand"];
 const SIDE: usize = 84;
@@ -81,160 +81,57 @@ impl Size {
     }
 }
 
-/// CPU time of this thread; counted in steps of the scheduler, some milliseconds.
-fn thread_cpu() -> f64 {
-    let text = std::fs::read_to_string("/proc/thread-self/schedstat").unwrap();
-    text.split_whitespace().next().unwrap().parse::<f64>().unwrap() / 1e9
-}
-
-/// CPU seconds of one of `times` runs on this thread; says if it waited much longer than it worked.
-fn timed(times: usize, work: &mut dyn FnMut()) -> f64 {
-    let (wall, cpu) = (Instant::now(), thread_cpu());
-    (0..times).for_each(|_| work());
-    let (wall, cpu) = (wall.elapsed().as_secs_f64(), thread_cpu() - cpu);
-    if wall > 3.0 * cpu {
-        eprintln!("note: the machine was busy: {wall:.2} s for {cpu:.2} s of work");
-    }
-    cpu / times as f64
-}
-
-struct Peer {
-    child: Child,
-    orders: ChildStdin,
-    answers: BufReader<ChildStdout>,
-}
-
-impl Peer {
-    fn start(python: &str) -> Self {
-        let script = concat!(env!("CARGO_MANIFEST_DIR"), "/../../benches/peers/vision_torch.py");
-        let mut command = Command::new(python);
-        let mut child = command.arg(script).stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
-        let (orders, answers) = (child.stdin.take().unwrap(), BufReader::new(child.stdout.take().unwrap()));
-        let mut peer = Self { child, orders, answers };
-        peer.read();
-        peer
-    }
-
-    fn read(&mut self) -> serde_json::Value {
-        let mut line = String::new();
-        self.answers.read_line(&mut line).unwrap();
-        serde_json::from_str(&line).expect("the peer answers in JSON")
-    }
-
-    fn ask(&mut self, work: &str, size: &str, batch: usize, times: usize) -> serde_json::Value {
-        let order = json!({ "work": work, "size": size, "batch": batch, "threads": 1, "times": times });
-        writeln!(self.orders, "{order}").unwrap();
-        self.read()
-    }
-
-    fn end(self) {
-        let Self { mut child, orders, .. } = self;
-        drop(orders);
-        child.wait().unwrap();
-    }
-}
-
-struct Bench {
-    python: Option<String>,
-    rounds: usize,
-    only: String,
-    rows: Vec<serde_json::Value>,
-}
-
 impl Bench {
-    /// Both sides in turns, after one run of each to warm up.
-    fn in_turns(&mut self, name: &str, bar: f64, order: (&str, &str, usize, usize), mut ours: impl FnMut() -> f64) {
-        let (work, size, batch, times) = order;
-        let mut peer = self.python.as_deref().map(Peer::start);
-        let (mut best, mut theirs) = (f64::INFINITY, None);
-        for round in 0..=self.rounds {
-            let pair = (ours(), peer.as_mut().map(|p| p.ask(work, size, batch, times)["cpu"].as_f64().unwrap()));
-            if round > 0 {
-                best = best.min(pair.0);
-                theirs = pair.1.map(|x| theirs.map_or(x, |least: f64| least.min(x)));
-            }
-        }
-        peer.into_iter().for_each(Peer::end);
-        self.row(&format!("{name}, CPU"), "ms", best * 1e3, theirs.map(|s| s * 1e3), bar);
-    }
-
-    fn row(&mut self, work: &str, unit: &str, ours: f64, peer: Option<f64>, bar: f64) {
-        let ratio = peer.map(|peer| ours / peer);
-        let met = ratio.map(|ratio| ratio <= bar);
-        let verdict = met.map_or("", |met| if met { "met" } else { "MISSED" });
-        let show = |value: Option<f64>| value.map_or("-".to_string(), |v| format!("{v:.2}"));
-        println!(
-            "{work:<64} {:>10} {:>10} {unit:<4} {:>7} {bar:>5} {verdict}",
-            show(Some(ours)),
-            show(peer),
-            show(ratio)
-        );
-        self.rows.push(json!({
-            "work": work, "unit": unit, "ours": ours, "peer": peer, "ratio": ratio, "bar": bar, "met": met,
-        }));
-    }
-
     fn train(&mut self, size: &Size, batch: usize, bar: f64) {
         let name = format!("ACT train {}, 2 cameras, batch {batch}", size.name);
-        if name.contains(&self.only) {
+        if self.wants(&name) {
             let (data, mut trainer) = (size.batch(batch), size.trainer());
+            let order = json!({ "work": "train", "size": size.name, "batch": batch, "threads": 1, "times": 1 });
+            let mut peer = self.peer();
+            let theirs = peer.as_mut().map(|peer| || peer.timed(&order));
             let ours = || timed(1, &mut || drop(trainer.step(&data).unwrap()));
-            self.in_turns(&name, bar, ("train", size.name, batch, 1), ours);
+            self.in_turns(&name, Some(bar), false, ours, theirs);
         }
     }
 
     fn predict(&mut self, size: &Size, bar: f64) {
         let name = format!("ACT predict {}, 2 cameras, batch 1", size.name);
-        if name.contains(&self.only) {
+        if self.wants(&name) {
             let (model, times) = (size.model(), 10);
             let one = size.batch(1).observation;
+            let order = json!({ "work": "predict", "size": size.name, "batch": 1, "threads": 1, "times": times });
+            let mut peer = self.peer();
+            let theirs = peer.as_mut().map(|peer| || peer.timed(&order));
             let ours = || timed(times, &mut || drop(model.predict(&one).unwrap()));
-            self.in_turns(&name, bar, ("predict", size.name, 1, times), ours);
+            self.in_turns(&name, Some(bar), false, ours, theirs);
         }
     }
 
     /// Peak memory of two training steps, each side in a process of its own; torch's import is taken off.
     fn memory(&mut self, size: &Size, batch: usize, bar: f64) {
         let name = format!("ACT train {}, 2 cameras, batch {batch}, peak memory", size.name);
-        if !name.contains(&self.only) {
+        if !self.wants(&name) {
             return;
         }
-        let me = std::env::current_exe().unwrap();
-        let output = Command::new(me).args(["--memory-of", size.name, &batch.to_string()]).output().unwrap();
-        let ours: f64 = String::from_utf8(output.stdout).unwrap().trim().parse().unwrap();
-        let theirs = self.python.as_deref().map(|python| {
-            let mut peer = Peer::start(python);
-            peer.ask("train", size.name, batch, 2);
-            let answer = peer.ask("memory", size.name, batch, 1);
-            peer.end();
+        let ours = in_own_process(&["--memory-of", size.name, "--batch", &batch.to_string()]);
+        let theirs = self.peer().map(|mut peer| {
+            peer.ask(&json!({ "work": "train", "size": size.name, "batch": batch, "threads": 1, "times": 2 }));
+            let answer = peer.ask(&json!({ "work": "memory" }));
             answer["peak"].as_f64().unwrap() - answer["import"].as_f64().unwrap()
         });
-        self.row(&name, "MB", ours / 1e6, theirs.map(|peak| peak / 1e6), bar);
+        self.row(&name, "MB", ours / 1e6, theirs.map(|peak| peak / 1e6), Some(bar));
     }
 }
 
-/// Bytes that this process had in memory at its fullest.
-fn peak_memory() -> f64 {
-    let status = std::fs::read_to_string("/proc/self/status").unwrap();
-    let line = status.lines().find(|line| line.starts_with("VmHWM:")).unwrap();
-    line.split_whitespace().nth(1).unwrap().parse::<f64>().unwrap() * 1024.0
-}
-
 fn main() {
-    let args: Vec<String> = std::env::args().collect();
-    let at = |name: &str| args.iter().position(|a| a == name);
-    let option = |name: &str| at(name).and_then(|i| args.get(i + 1).cloned());
-    if let Some(i) = at("--memory-of") {
-        let (size, batch) = (size(&args[i + 1]), args[i + 2].parse().unwrap());
+    if let Some(name) = option("--memory-of") {
+        let (size, batch) = (size(&name), option("--batch").unwrap().parse().unwrap());
         let (data, mut trainer) = (size.batch(batch), size.trainer());
         (0..2).for_each(|_| drop(trainer.step(&data).unwrap()));
         println!("{}", peak_memory());
         return;
     }
-    let rounds = option("--rounds").map_or(3, |n| n.parse().expect("--rounds takes a number"));
-    let only = option("--only").unwrap_or_default();
-    let mut bench = Bench { python: option("--peer"), rounds, only, rows: Vec::new() };
-    println!("{:<64} {:>10} {:>10} {:<4} {:>7} {:>5}", "work", "ours", "peer", "", "ratio", "bar");
+    let mut bench = Bench::new("vision_torch.py", 3);
     bench.train(&size("narrow"), 64, 0.8);
     bench.train(&size("d256"), 8, 0.8);
     bench.train(&size("d256"), 64, 0.8);
@@ -244,7 +141,5 @@ fn main() {
     bench.memory(&size("narrow"), 64, 0.6);
     bench.memory(&size("d256"), 8, 0.6);
     bench.memory(&size("d512"), 8, 0.6);
-    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../target/bench");
-    std::fs::create_dir_all(folder).unwrap();
-    std::fs::write(format!("{folder}/vision.json"), serde_json::to_string_pretty(&bench.rows).unwrap()).unwrap();
+    bench.write("vision");
 }

@@ -132,7 +132,9 @@ pub fn policies() -> Vec<(PolicyConfig, Signature)> {
         ("diffusion", with(&clean, "vision", keypoints), &of.image_history),
         ("diffusion", with(&denoising, "transformer", tokens), &of.entities),
         ("flow", denoising.clone(), &of.plain),
+        ("flow", with(&denoising, "vision", vision.clone()), &of.image_history),
         ("flow", with(&denoising, "transformer", encoded.clone()), &of.entities),
+        ("mip", with(&denoising, "vision", vision), &of.image_history),
         ("mip", with(&denoising, "transformer", encoded), &of.entities),
         ("mip", denoising, &of.history),
     ];

@@ -5,7 +5,6 @@
 
 use crate::maze::{Maze, MazeTask};
 use crate::rng::PuzzleRng;
-use crate::split::Split;
 
 /// Up, down, left, right: the actions, by number.
 pub const MOVES: [(isize, isize); 4] = [(-1, 0), (1, 0), (0, -1), (0, 1)];
@@ -36,11 +35,6 @@ impl Walker {
     /// The study's `maze5-rl`: an empty 5×5 grid, from (0,0) to (4,4).
     pub fn empty5() -> Self {
         Self::new(MazeTask::Empty5.draw(&mut PuzzleRng::new(0, 0)))
-    }
-
-    /// `maze5-walls`: random walls, start and goal, from one of the splits.
-    pub fn walls5(split: Split, rng: &mut PuzzleRng) -> Self {
-        Self::new(MazeTask::Walls5.draw_from(split, rng))
     }
 
     /// A walker at the start of any maze.
@@ -112,6 +106,7 @@ impl Walker {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::split::Split;
 
     #[test]
     fn the_best_return_of_the_study_is_11_52_in_8_moves() {
@@ -160,7 +155,7 @@ mod tests {
 
     #[test]
     fn planes_show_walker_walls_and_goal() {
-        let walker = Walker::walls5(Split::Train, &mut PuzzleRng::new(2, 0));
+        let walker = Walker::new(MazeTask::Walls5.draw_from(Split::Train, &mut PuzzleRng::new(2, 0)));
         let planes = walker.observe_planes();
         assert_eq!(
             planes.iter().filter(|&&x| x == 1.0).count(),

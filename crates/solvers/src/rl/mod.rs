@@ -91,13 +91,6 @@ pub struct RlConfig {
     pub advantage_std_floor: f64,
 }
 
-impl Algorithm {
-    /// PPO with the usual settings: clip 0.2, 4 passes, batches of 256 steps.
-    pub fn ppo() -> Self {
-        Self::Ppo { clip: 0.2, epochs: 4, batch_size: 256, target_kl: None }
-    }
-}
-
 impl RlConfig {
     /// `algorithm` with defaults for the rest.
     pub fn new(algorithm: Algorithm) -> Self {

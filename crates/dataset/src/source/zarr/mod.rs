@@ -11,6 +11,8 @@ use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
 use half::f16;
 use serde::Deserialize;
 use serde_json::Value;
@@ -207,7 +209,7 @@ impl Stored {
         let number = match value {
             // bytes are written in base64
             Value::String(text) if !self.dtype.is_numeric() => {
-                return base64(text).filter(|bytes| bytes.len() <= self.size).map(padded);
+                return STANDARD.decode(text).ok().filter(|bytes| bytes.len() <= self.size).map(padded);
             }
             // the bits of a NaN that is another than numpy's
             Value::String(text) if text.starts_with("0x") => {
@@ -250,21 +252,6 @@ impl Stored {
             }
         })
     }
-}
-
-/// The bytes that a text in base64 stands for.
-fn base64(text: &str) -> Option<Vec<u8>> {
-    const LETTERS: &[u8] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
-    let digits: Option<Vec<u32>> = text
-        .trim_end_matches('=')
-        .bytes()
-        .map(|letter| LETTERS.iter().position(|&known| known == letter).map(|digit| digit as u32))
-        .collect();
-    let bytes = |four: &[u32]| {
-        let bits = four.iter().fold(0, |bits, digit| bits << 6 | digit) << (6 * (4 - four.len()));
-        bits.to_be_bytes()[1..four.len()].to_vec()
-    };
-    Some(digits?.chunks(4).flat_map(bytes).collect())
 }
 
 fn level(value: f32) -> Option<u8> {

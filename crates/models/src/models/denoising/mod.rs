@@ -263,14 +263,6 @@ impl<M: Method> Denoising<M> {
         self.method.sample(&zeros, &mut || noise(&zeros), &mut answer)
     }
 
-    /// The prediction on candle's operations.
-    #[cfg(test)]
-    pub(crate) fn predict_composed(&self, observation: &Features<Tensor>) -> Result<Tensor> {
-        let (rows, rng) = (check_observation(M::NAME, &self.signature, observation)?, &mut Rng::new(0, "predict"));
-        let noise = &mut |zeros: &Tensor| normals_like(zeros, rng);
-        self.cache.composed_predict(&self.params, |cx| self.drawn(cx, rows, observation, noise))
-    }
-
     /// What the network gives in a prediction.
     #[cfg(test)]
     pub(crate) fn answered(&self, observation: &Features<Tensor>, x: &Tensor, steps: &[f32]) -> Result<Tensor> {

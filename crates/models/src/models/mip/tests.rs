@@ -1,48 +1,12 @@
 #![allow(clippy::unwrap_used)]
 use super::*;
-use crate::model::PolicyModel;
 use crate::models::denoising::NetworkConfig;
-use crate::testing::{
-    assert_the_gradient_is_the_slope, assert_the_step_is_the_composed_one, batch, losses_of_training, move_parameters,
-    signatures, vision_config,
-};
+use crate::testing::{batch, losses_of_training, signatures};
 use candle_core::{DType, Device};
 
 fn small() -> Config {
     let network = NetworkConfig { down_dims: vec![8, 16], n_groups: 4, step_embed_dim: 8, ..NetworkConfig::default() };
     Config { action_horizon: 8, network, ..Config::default() }
-}
-
-#[test]
-fn the_step_on_kernels_is_the_composed_one() {
-    let of = signatures();
-    for (signature, mask_padding) in [(&of.plain, false), (&of.history, true)] {
-        let model = Mip::new(&Config { mask_padding, ..small() }, signature, 1, &Backend::CPU).unwrap();
-        move_parameters(&model);
-        assert_the_step_is_the_composed_one(&model, &batch(signature, 8, 5, 3), &format!("{mask_padding}"));
-    }
-}
-
-#[test]
-fn from_images_too() {
-    let signature = signatures().image_history;
-    let model = Mip::new(&Config { vision: Some(vision_config()), ..small() }, &signature, 1, &Backend::CPU).unwrap();
-    move_parameters(&model);
-    let batch = batch(&signature, 8, 3, 3);
-    assert_the_step_is_the_composed_one(&model, &batch, "images");
-    let got = model.predict(&batch.observation).unwrap();
-    let want = model.predict_composed(&batch.observation).unwrap();
-    let off = (got - want).unwrap().abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap();
-    assert!(off < 1e-4, "{off}");
-}
-
-#[test]
-fn the_gradient_is_the_slope_of_the_loss() {
-    let of = signatures();
-    for (signature, mask_padding) in [(&of.plain, false), (&of.history, true)] {
-        let model = Mip::new(&Config { mask_padding, ..small() }, signature, 1, &Backend::CPU).unwrap();
-        assert_the_gradient_is_the_slope(&model, &batch(signature, 8, 3, 3), &format!("{mask_padding}"));
-    }
 }
 
 #[test]
