@@ -101,6 +101,46 @@ fn cameras_give_pictures_that_convert() {
 }
 
 #[test]
+fn what_was_recorded_stays_as_it_was_recorded() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let (raw, made) = (short(folder.path(), 2), folder.path().join("made.hdf5"));
+    let recorded = [
+        ("data", "seeds", "1000000-1000004"),
+        ("data", "skill", "mixed"),
+        ("data/demo_1", "ep_meta", "{\"group\":\"left\"}"),
+    ];
+    let file = hdf5::File::open_rw(&raw).expect("opens");
+    for (place, name, value) in recorded {
+        let value: hdf5::types::VarLenUnicode = value.parse().expect("text");
+        let group = file.group(place).expect("there");
+        let attr = group.new_attr::<hdf5::types::VarLenUnicode>().create(name).expect("created");
+        attr.write_scalar(&value).expect("written");
+    }
+    file.close().expect("closes");
+    succeeds(&mut data(["extract", text(&raw), text(&made), "--workers", "1"]));
+    let file = hdf5::File::open(&made).expect("opens");
+    for (place, name, value) in recorded {
+        let attr = file.group(place).expect("there").attr(name).expect("it is kept");
+        let kept = attr.read_scalar::<hdf5::types::VarLenUnicode>().expect("text");
+        assert_eq!(kept.as_str(), value, "{place}: {name}");
+    }
+    // counted anew: the recording says how many steps its three demos had
+    let total = file.group("data").expect("there").attr("total").expect("there");
+    assert_eq!(total.read_scalar::<i64>().expect("a number"), 2);
+}
+
+#[test]
+fn what_is_wiped_stays_wiped_in_a_replay() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let (file, film) = (folder.path().join("wipe.hdf5"), folder.path().join("wipe.mp4"));
+    succeeds(&mut data(["collect", "--task", "Wipe", "--episodes", "1", "--workers", "1", "--out", text(&file)]));
+    let replay = ["replay", text(&file), "--demo", "0", "--video", text(&film), "--size", "64", "--workers", "1"];
+    let said = succeeds(&mut data(replay)).stdout;
+    let said = String::from_utf8_lossy(&said);
+    assert!(said.contains("images at 20 Hz, success"), "{said}");
+}
+
+#[test]
 fn a_model_that_does_not_load_is_one_line_with_file_and_demo() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let (raw, out) = (short(folder.path(), 2), folder.path().join("out.hdf5"));

@@ -17,6 +17,9 @@ use crate::error::{RecordingError, Result};
 /// What is looked up in the simulator; all else of a demo, such as `action_dict`, stays as it was recorded.
 const COMPUTED: [&str; 4] = ["obs", "next_obs", "rewards", "dones"];
 
+/// Attributes of the group `data` that are written anew; all others, such as `seeds`, stay as they were recorded.
+const WRITTEN: [&str; 2] = ["total", "env_args"];
+
 /// What to extract and where to put it.
 #[derive(Debug, Clone)]
 pub struct ExtractOptions {
@@ -127,6 +130,7 @@ pub fn extract(
     }
     let ready = pool.ready().clone();
     same_generation(&options.raw, plan.env_version.as_deref(), &ready.simulator, ready.simulator_version())?;
+    let of_data = source.root()?.inner_attrs.remove("data").unwrap_or_default();
     let mut writer = RobomimicWriter::create(&options.out, &WriteOptions { gzip: options.gzip })?;
     let env_args = env_args(plan.env_args.as_ref(), &pool.ready().env_args);
     let (mut steps, mut done) = (0_u64, 0_usize);
@@ -150,10 +154,8 @@ pub fn extract(
             result.map_err(|error| replay_error(&options.raw, id, &ready, error)).and_then(|(recorded, episode)| {
                 steps += episode.steps as u64;
                 let mut made = demo(id, episode, options.next_obs)?;
-                // what was recorded stays as it was recorded
-                for (name, value) in recorded.attrs {
-                    made.attrs.entry(name).or_insert(value);
-                }
+                // what was recorded stays as it was recorded; the worker counted the steps
+                made.attrs.extend(recorded.attrs.into_iter().filter(|(name, _)| name != "num_samples"));
                 made.datasets.extend(recorded.datasets);
                 writer.add_demo(&made)?;
                 done += 1;
@@ -177,6 +179,9 @@ pub fn extract(
     writer.set_data_attr("total", &Array::from_i64(Vec::new(), &[steps as i64]))?;
     let text = serde_json::to_string_pretty(&env_args).expect("JSON is always text");
     writer.set_data_attr("env_args", &Array::from_str(&text))?;
+    for (name, value) in of_data.iter().filter(|(name, _)| !WRITTEN.contains(&name.as_str())) {
+        writer.set_data_attr(name, value)?;
+    }
     for (name, demos) in &plan.masks {
         writer.set_mask(name, demos)?;
     }

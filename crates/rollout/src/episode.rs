@@ -180,17 +180,25 @@ impl EpisodePlan {
     /// Runs the task's scripted expert in the episode of `seed`, until it has done the task or the cap is reached.
     ///
     /// # Errors
-    /// A failure of the worker; a task without an expert.
+    /// A failure of the worker; a task without an expert, or a cap beyond the task's own, where the expert ends.
     pub fn run_expert(&self, worker: &mut Worker, seed: u64) -> Result<Outcome, JobError> {
         let begun = Instant::now();
+        let Ready { task, max_steps: longest, .. } = worker.ready();
+        if self.max_steps > *longest {
+            let message =
+                format!("expected a cap of at most {longest} steps, where its expert ends, found {}", self.max_steps);
+            return Err(RolloutError::Refused { task: task.clone(), kind: "max_steps".to_owned(), message }.into());
+        }
         let Initial { fingerprint, group, .. } = worker.reset(seed)?;
-        let Scripted { rewards, solved, progress } =
+        let Scripted { rewards, solved, failure, progress } =
             worker.expert_evaluated(seed).map_err(|fault| no_expert(worker, fault))?;
         worker.check_quiet()?;
         let end = solved.iter().take(self.max_steps).position(|solved| *solved);
         let steps = end.map_or(solved.len().min(self.max_steps), |at| at + 1);
-        // how far it had come by a cap that is not its own is not known
-        let progress = progress.filter(|share| end.is_some() || *share < 1.0);
+        // how far it had come by a cap that is shorter than its episode is not known, nor why it was lost after that
+        let whole = solved.len() <= self.max_steps;
+        let progress = progress.filter(|_| end.is_some() || whole);
+        let failure = failure.filter(|_| end.is_none() && whole);
         let (wall, drawing) = (begun.elapsed(), Vec::new());
         Ok(Outcome {
             success: end.is_some(),
@@ -198,7 +206,7 @@ impl EpisodePlan {
             total_reward: rewards.iter().take(steps).sum(),
             fingerprint,
             group,
-            failure: None,
+            failure,
             progress,
             simulator: wall,
             drawing,

@@ -281,9 +281,12 @@ pub enum FaultKind {
     Pipe(std::io::Error),
 }
 
+/// A worker's words for what cannot be done, whichever worker is asked.
+const OF_THE_REQUEST: [&str; 6] = ["bad_action", "bad_request", "model", "mujoco", "no_renderer", "unknown_camera"];
+
 impl FaultKind {
     /// Whether what was asked cannot be done: the worker is well, and another one would say the same.
     pub(crate) fn is_of_the_request(&self) -> bool {
-        matches!(self, Self::Reported { kind, .. } if ["bad_request", "model"].contains(&kind.as_str()))
+        matches!(self, Self::Reported { kind, .. } if OF_THE_REQUEST.contains(&kind.as_str()))
     }
 }

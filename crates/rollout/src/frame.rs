@@ -240,7 +240,7 @@ pub fn checked_length(prefix: [u8; 8]) -> Result<usize, FrameError> {
             head: String::from_utf8_lossy(&prefix).into_owned(),
         });
     }
-    Ok(usize::try_from(found).expect("256 MiB fits a usize"))
+    Ok(usize::try_from(found).expect("2 GiB fit a usize"))
 }
 
 #[cfg(test)]

@@ -35,5 +35,5 @@ pub use locks::{lock, try_lock, try_lock_shared, without_locks};
 pub use message::{Control, PROTOCOL, Ready, Skill};
 pub use pool::{Incident, JobError, Pool, PoolOptions, RunEnd};
 pub use recorded::RecordedEpisode;
-pub use spec::{TimeLimits, WorkerSpec, robots_of, set_control_library};
+pub use spec::{TimeLimits, WorkerSpec, check_module, recorded_module, robots_of, set_control_library};
 pub use worker::{Image, Initial, Observations, Stepped, Worker};

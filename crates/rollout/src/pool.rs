@@ -7,6 +7,8 @@ use std::path::PathBuf;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError, mpsc};
 use std::time::Duration;
 
+use serde_json::Value;
+
 use crate::error::{FaultKind, RolloutError, WorkerFault};
 use crate::logs::LogFolder;
 use crate::message::Ready;
@@ -408,10 +410,50 @@ fn same_greeting(first: &Ready, other: &Ready) -> Result<(), RolloutError> {
     if first == other {
         return Ok(());
     }
-    let text = |ready: &Ready| serde_json::to_string(ready).unwrap_or_default();
+    let fields = |ready: &Ready| serde_json::to_value(ready).unwrap_or_default();
+    let (first, other) = (fields(first), fields(other));
+    // the first field in which they differ, as deep as there are fields
+    let (mut at, mut expected, mut found) = (String::new(), Some(&first), Some(&other));
+    while let (Some(Value::Object(mine)), Some(Value::Object(theirs))) = (expected, found) {
+        let mut names = mine.keys().chain(theirs.keys());
+        let Some(name) = names.find(|name| mine.get(*name) != theirs.get(*name)) else { break };
+        at = if at.is_empty() { name.clone() } else { format!("{at}.{name}") };
+        (expected, found) = (mine.get(name), theirs.get(name));
+    }
+    let text = |value: Option<&Value>| value.map_or_else(|| "nothing".to_owned(), ToString::to_string);
     Err(RolloutError::Handshake {
         what: "greeting of another worker of the same pool",
-        expected: text(first),
-        found: text(other),
+        expected: format!("{at} {}", text(expected)),
+        found: text(found),
     })
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use serde_json::json;
+
+    use super::*;
+
+    #[test]
+    fn a_greeting_that_differs_names_the_field() {
+        let ready = |versions: Value| -> Ready {
+            serde_json::from_value(json!({
+                "protocol": 2, "simulator": "robosuite", "versions": versions, "task": "Lift", "env_name": "Lift",
+                "control": "compiled", "control_freq": 20.0, "max_steps": 400, "action_dim": 1, "action_low": [-1.0],
+                "action_high": [1.0], "observations": {"object": [10]}, "env_args": {"env_kwargs": {"robots": "Panda"}},
+            }))
+            .unwrap()
+        };
+        let first = ready(json!({"mujoco": "3.3.7", "numpy": "2.3.5"}));
+        assert!(same_greeting(&first, &first.clone()).is_ok());
+        for (other, text) in [
+            (json!({"mujoco": "3.3.7", "numpy": "2.3.4"}), "expected versions.numpy \"2.3.5\", found \"2.3.4\""),
+            (json!({"mujoco": "3.3.7"}), "expected versions.numpy \"2.3.5\", found nothing"),
+            (json!({"a": "1", "mujoco": "3.3.7", "numpy": "2.3.5"}), "expected versions.a nothing, found \"1\""),
+        ] {
+            let error = same_greeting(&first, &ready(other)).unwrap_err().to_string();
+            assert!(error.ends_with(text), "{error}");
+        }
+    }
 }

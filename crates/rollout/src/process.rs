@@ -7,12 +7,12 @@ use std::io::{ErrorKind, Read, Seek, SeekFrom, Write};
 use std::os::fd::AsFd;
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
-use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
+use std::process::{Child, ChildStdin, ChildStdout, Command, ExitStatus, Stdio};
 use std::sync::{Mutex, PoisonError, mpsc};
 use std::time::{Duration, Instant};
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
-use rustix::process::{Pid, Resource, Rlimit, Signal, kill_process_group, prlimit};
+use rustix::process::{Pid, Resource, Rlimit, Signal, WaitId, WaitIdOptions, kill_process_group, prlimit, waitid};
 
 use crate::error::{FaultKind, RolloutError};
 use crate::frame::checked_length;
@@ -28,6 +28,8 @@ pub(super) struct Process {
     stdin: Option<ChildStdin>,
     stdout: ChildStdout,
     log: PathBuf,
+    /// Whether it has been reaped, and its children killed before: its id may be another's by now.
+    reaped: bool,
     /// The process that started it; after a fork the other one has only a copy of this.
     owner: u32,
 }
@@ -43,7 +45,8 @@ impl Process {
         let mut child = spawn_for_good(command).map_err(spawned)?;
         let stdin = child.stdin.take().expect("stdin is piped");
         let stdout = child.stdout.take().expect("stdout is piped");
-        let process = Self { child, stdin: Some(stdin), stdout, log: log.to_owned(), owner: std::process::id() };
+        let (log, owner) = (log.to_owned(), std::process::id());
+        let process = Self { child, stdin: Some(stdin), stdout, log, reaped: false, owner };
         process.prepare(memory_limit).map_err(spawned)?;
         Ok(process)
     }
@@ -137,7 +140,7 @@ impl Process {
     fn died(&mut self) -> FaultKind {
         let until = Instant::now() + Duration::from_secs(1);
         loop {
-            match self.child.try_wait() {
+            match self.ended() {
                 Ok(Some(status)) => return FaultKind::Died(status.to_string()),
                 Ok(None) if Instant::now() < until => {
                     std::thread::sleep(Duration::from_millis(5));
@@ -146,6 +149,23 @@ impl Process {
                 Err(error) => return FaultKind::Pipe(error),
             }
         }
+    }
+
+    /// How it ended, if it has. Its children are killed before it is reaped: until then its id is nobody else's.
+    fn ended(&mut self) -> std::io::Result<Option<ExitStatus>> {
+        if !self.reaped {
+            let look = WaitIdOptions::EXITED | WaitIdOptions::NOHANG | WaitIdOptions::NOWAIT;
+            if waitid(WaitId::Pid(Pid::from_child(&self.child)), look)?.is_none() {
+                return Ok(None);
+            }
+            self.kill_group();
+            self.reaped = true;
+        }
+        self.child.try_wait()
+    }
+
+    fn kill_group(&self) {
+        let _ = kill_process_group(Pid::from_child(&self.child), Signal::KILL);
     }
 
     /// The last lines of its stderr, joined by ` | `.
@@ -171,7 +191,7 @@ impl Process {
         }
         let until = Instant::now() + patience;
         while Instant::now() < until {
-            match self.child.try_wait() {
+            match self.ended() {
                 Ok(Some(_)) | Err(_) => return,
                 Ok(None) => std::thread::sleep(Duration::from_millis(2)),
             }
@@ -181,12 +201,10 @@ impl Process {
 
 impl Drop for Process {
     fn drop(&mut self) {
-        if !self.is_own() {
+        if !self.is_own() || self.reaped {
             return;
         }
-        // The whole group, before the leader is reaped: its id cannot have been reused yet. A leader
-        // that has been reaped leaves a group only if children of it live on.
-        let _ = kill_process_group(Pid::from_child(&self.child), Signal::KILL);
+        self.kill_group();
         let _ = self.child.wait();
     }
 }
@@ -340,6 +358,19 @@ mod tests {
         let fault = process.receive(within(20_000)).unwrap_err();
         assert!(fault.to_string().contains("exit status: 7"), "{fault}");
         assert_eq!(process.stderr_tail(), "first | last words");
+    }
+
+    #[test]
+    fn the_children_of_an_ended_process_end_with_it() {
+        let (dir, mut process) = shell("sleep 1000 >/dev/null & echo $! >&2; exit 7");
+        let fault = process.receive(within(20_000)).unwrap_err();
+        assert!(fault.to_string().contains("exit status: 7"), "{fault}");
+        let child = std::fs::read_to_string(dir.path().join("log")).unwrap().trim().parse().unwrap();
+        let until = Instant::now() + Duration::from_secs(20);
+        while alive(child) {
+            assert!(Instant::now() < until, "process {child} survived");
+            std::thread::sleep(Duration::from_millis(5));
+        }
     }
 
     #[test]

@@ -18,6 +18,25 @@ pub fn robots_of(task: &str, robots: &[String]) -> serde_json::Value {
     serde_json::json!({"type": 1, "env_name": task, "env_kwargs": {"robots": robots}})
 }
 
+/// The module that registered the recorded environment, as robomimic's `env_args` name it.
+pub fn recorded_module(env_args: &serde_json::Value) -> Option<&str> {
+    env_args.get("env_module")?.get("name")?.as_str()
+}
+
+/// Refuses an environment that was recorded with a module which the user did not name: files come from others, and only the
+/// user decides whose code runs.
+///
+/// # Errors
+/// What was recorded, and how to name it.
+pub fn check_module(recorded: Option<&str>, named: Option<&str>) -> Result<(), String> {
+    match recorded.filter(|_| named.is_none()) {
+        None => Ok(()),
+        Some(module) => Err(format!(
+            "recorded with module {module:?}, whose code runs only if you name it with --env-module (in Python: env_module)"
+        )),
+    }
+}
+
 /// Runs a module of the harness, having asked Linux (`prctl(PR_SET_PDEATHSIG, SIGKILL)`) to kill it with us: a
 /// worker that hangs or is stopped would not see its pipe close.
 pub(super) fn boot(module: &str) -> String {
@@ -39,7 +58,7 @@ pub struct WorkerSpec {
     pub harness: PathBuf,
     /// The task.
     pub task: String,
-    /// The control loop to ask for; the worker may fall back to robosuite's.
+    /// The control loop to ask for; the worker may fall back to robosuite's. A simulator's own is not asked for.
     pub control: Control,
     /// A Python module of the user's that registers environments.
     pub env_module: Option<String>,
@@ -75,12 +94,10 @@ impl WorkerSpec {
         }
     }
 
-    /// The same for an environment that was recorded with robomimic's `env_args`: its robots, its controllers, and its
-    /// module unless another is named already.
+    /// The same for an environment that was recorded with robomimic's `env_args`: its robots and its controllers. A module that
+    /// they name is left alone, see [`check_module`].
     #[must_use]
     pub fn recorded(mut self, env_args: Option<&serde_json::Value>) -> Self {
-        let module = || Some(env_args?.get("env_module")?.get("name")?.as_str()?.to_owned());
-        self.env_module = self.env_module.take().or_else(module);
         self.env_args = env_args.filter(|args| args.get("env_kwargs").is_some()).cloned();
         self
     }
@@ -102,7 +119,9 @@ impl WorkerSpec {
     pub(super) fn command(&self) -> Command {
         let mut command = self.python("actrm_harness.worker");
         command.args(["--task", &self.task]);
-        command.args(["--control", self.control.as_str()]);
+        if self.control != Control::Own {
+            command.args(["--control", self.control.as_str()]);
+        }
         if let Some(module) = &self.env_module {
             command.args(["--env-module", module]);
         }
@@ -218,6 +237,29 @@ mod tests {
         let set = command.get_envs().find(|(name, _)| *name == BLAS_KERNELS).and_then(|(_, value)| value);
         let chosen = std::env::var_os(BLAS_KERNELS).is_some();
         assert_eq!(set, (!chosen && has_haswells_kernels()).then(|| "Haswell".as_ref()));
+    }
+
+    #[test]
+    fn a_recorded_module_is_not_imported() {
+        let python = Python { path: "python".into(), origin: "--python".into() };
+        let env_args = serde_json::json!({"env_kwargs": {}, "env_module": {"name": "theirs", "sha256": "0"}});
+        let spec = WorkerSpec::new(python, PathBuf::from("harness"), "Lift").recorded(Some(&env_args));
+        assert!(!spec.command().get_args().any(|word| word == "--env-module"));
+        let recorded = recorded_module(&env_args);
+        let refused = check_module(recorded, None).expect_err("nobody named it");
+        assert!(refused.contains("\"theirs\"") && refused.contains("--env-module"), "{refused}");
+        assert_eq!(check_module(recorded, Some("mine")), Ok(()));
+        assert_eq!(check_module(None, None), Ok(()));
+    }
+
+    #[test]
+    fn a_loop_is_asked_for_unless_it_is_the_simulator_s_own() {
+        let python = Python { path: "python".into(), origin: "--python".into() };
+        let mut spec = WorkerSpec::new(python, PathBuf::from("harness"), "Lift");
+        for (control, asked) in [(Control::Compiled, true), (Control::Robosuite, true), (Control::Own, false)] {
+            spec.control = control;
+            assert_eq!(spec.command().get_args().any(|word| word == "--control"), asked, "{control}");
+        }
     }
 
     /// A program that was built anew while it runs is found under a path that is none, `… (deleted)` on Linux; a study that

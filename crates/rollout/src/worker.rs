@@ -93,6 +93,8 @@ pub struct Scripted {
     pub rewards: Vec<f64>,
     /// Whether the task was done after each step.
     pub solved: Vec<bool>,
+    /// In a word why the task could no longer be done, where that ended the episode.
+    pub failure: Option<String>,
     /// Which share of its way the episode came, where stages are known.
     pub progress: Option<f64>,
 }
@@ -246,7 +248,7 @@ impl Worker {
     /// # Errors
     /// Any failure of the worker.
     pub fn expert(&mut self, seed: u64, expert: Option<&str>, skill: Skill) -> Result<RecordedEpisode, WorkerFault> {
-        self.scripted(seed, "demonstration", expert, skill).map(|(episode, _)| episode)
+        self.scripted(seed, "demonstration", expert, skill).map(|(episode, ..)| episode)
     }
 
     /// Runs the scripted expert in the episode that an evaluation of `seed` begins with.
@@ -254,7 +256,7 @@ impl Worker {
     /// # Errors
     /// Any failure of the worker.
     pub fn expert_evaluated(&mut self, seed: u64) -> Result<Scripted, WorkerFault> {
-        let (episode, progress) = self.scripted(seed, "evaluation", None, Skill::Good)?;
+        let (episode, failure, progress) = self.scripted(seed, "evaluation", None, Skill::Good)?;
         let read = |name: &str| {
             let tensor = episode.tensors.get(name).ok_or_else(|| format!("no array {name:?} in the episode"))?;
             Ok((tensor, name.to_owned()))
@@ -269,23 +271,26 @@ impl Worker {
         if let Some(last) = solved.last_mut() {
             *last = i64::from(episode.success);
         }
-        Ok(Scripted { rewards, solved: solved.into_iter().map(|done| done != 0).collect(), progress })
+        let solved = solved.into_iter().map(|done| done != 0).collect();
+        Ok(Scripted { rewards, solved, failure, progress })
     }
 
+    /// The episode, why it was lost and how far it came.
     fn scripted(
         &mut self,
         seed: u64,
         split: &str,
         expert: Option<&str>,
         skill: Skill,
-    ) -> Result<(RecordedEpisode, Option<f64>), WorkerFault> {
+    ) -> Result<(RecordedEpisode, Option<String>, Option<f64>), WorkerFault> {
         self.next_id += 1;
         let request = Request::Expert { id: self.next_id, seed, split, expert, skill };
         let (reply, frame) = self.ask(&request, Vec::new(), self.limits.episode)?;
         match reply {
-            Reply::Expert(reply) => {
+            Reply::Expert(mut reply) => {
                 let progress = share(reply.progress).map_err(|kind| self.fault("expert", kind))?;
-                Ok((self.recorded("expert", reply, frame)?, progress))
+                let failure = reply.failure.take();
+                Ok((self.recorded("expert", reply, frame)?, failure, progress))
             }
             other => Err(self.fault("expert", unexpected("expert", &other))),
         }

@@ -10,7 +10,9 @@ use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
 use common::{alive, impatient, options, spec, wait_until, wrapped};
-use rollout::{JobError, Pool, PoolOptions, RecordedEpisode, RolloutError, RunEnd, Skill, TimeLimits, Worker};
+use rollout::{
+    EpisodePlan, JobError, Pool, PoolOptions, RecordedEpisode, RolloutError, RunEnd, Skill, TimeLimits, Worker,
+};
 use rustix::process::{Pid, Signal, kill_process};
 
 /// Everything that an episode shows, to the last bit: fingerprint, observations, rewards.
@@ -451,4 +453,45 @@ fn actions_without_limits_are_taken_and_limits_that_are_no_numbers_are_named() {
     assert!(pool.ready().sources.contains_key("odd_simulator") && pool.ready().sources.contains_key("actrm_harness"));
     let error = Pool::start(PoolOptions::new(odd(dir.path(), "NanLimit"), 1)).err().unwrap().to_string();
     assert!(error.contains("limits of an action"), "{error}");
+}
+
+#[test]
+fn what_cannot_be_drawn_is_not_asked_of_other_workers() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut pool = Pool::start(PoolOptions::new(odd(dir.path(), "Unlimited"), 1)).unwrap();
+    let work = |(): &mut (), worker: &mut Worker, _| Ok(worker.render("nowhere", 8, 8)?);
+    let mut errors = Vec::new();
+    pool.run(0..1, &|job| job, &|| Ok(()), &work, &mut |_, result| {
+        errors.extend(result.err());
+        ControlFlow::Continue(())
+    })
+    .unwrap();
+    assert!(matches!(errors[0], RolloutError::Episode { attempts: 1, .. }), "{}", errors[0]);
+    assert!(errors[0].to_string().contains("no camera nowhere"), "{}", errors[0]);
+}
+
+/// The expert of `ExpertLoses` is lost in its fourth step, half way; the task's own cap is 30 steps.
+#[test]
+fn an_expert_s_episode_says_how_it_was_lost_where_it_was_within_the_cap() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut pool = Pool::start(PoolOptions::new(odd(dir.path(), "ExpertLoses"), 1)).unwrap();
+    let mut run = |max_steps: usize| {
+        let plan = EpisodePlan::new(pool.ready(), [], max_steps).unwrap();
+        let work = |(): &mut (), worker: &mut Worker, seed| plan.run_expert(worker, seed);
+        let mut outcomes = Vec::new();
+        let end = pool.run(0..1, &|job| job, &|| Ok(()), &work, &mut |_, result| {
+            outcomes.push(result.unwrap());
+            ControlFlow::Continue(())
+        });
+        end.map(|_| outcomes.remove(0))
+    };
+    for (max_steps, steps, failure, progress) in
+        [(30, 4, Some("fell"), Some(0.5)), (4, 4, Some("fell"), Some(0.5)), (3, 3, None, None)]
+    {
+        let outcome = run(max_steps).unwrap();
+        assert_eq!((outcome.success, outcome.steps), (false, steps));
+        assert_eq!((outcome.failure.as_deref(), outcome.progress), (failure, progress), "{max_steps} steps");
+    }
+    let error = run(31).unwrap_err().to_string();
+    assert!(error.contains("at most 30 steps") && error.contains("found 31"), "{error}");
 }

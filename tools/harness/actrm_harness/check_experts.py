@@ -14,8 +14,10 @@ good the bar is 80%, and a line for each demonstrator says how often and how lon
 import argparse
 import json
 import multiprocessing
+import os
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -101,8 +103,7 @@ def main() -> int:
             for outcome in play(wanted_of, [seed for seed in wanted if seed not in known], args.workers):
                 known[outcome.seed] = outcome
                 if args.out:
-                    with args.out.open("a") as file:
-                        file.write(json.dumps(asdict(outcome)) + "\n")
+                    write(args.out, outcome)
             found.append([known[seed] for seed in wanted])
             met &= report(task, found[-1])
         if args.control == "both":
@@ -111,11 +112,24 @@ def main() -> int:
 
 
 def read(path: Path | None) -> list[Outcome]:
-    """The outcomes of an earlier run; a last line that was cut off is not one."""
+    """The outcomes of an earlier run; a line that was cut off is not one."""
     if path is None or not path.exists():
         return []
-    lines = path.read_text().split("\n")[:-1]
-    return [Outcome(**json.loads(line)) for line in lines]
+    found: list[Outcome] = []
+    for line in path.read_text().split("\n")[:-1]:
+        with suppress(json.JSONDecodeError):
+            found.append(Outcome(**json.loads(line)))
+    return found
+
+
+def write(path: Path, outcome: Outcome) -> None:
+    """Add an outcome, on a line of its own whatever an earlier run left."""
+    with path.open("a+b") as file:
+        if file.tell() > 0:
+            file.seek(-1, os.SEEK_END)
+            if file.read(1) != b"\n":
+                file.write(b"\n")
+        file.write(json.dumps(asdict(outcome)).encode() + b"\n")
 
 
 def play(of: tuple[str, str, str | None, str], seeds: list[int], workers: int) -> Iterator[Outcome]:

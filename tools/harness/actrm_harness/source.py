@@ -19,12 +19,15 @@ CONTENT = frozenset(
 """Files whose content counts: code, models, configurations, libraries."""
 SIZE = frozenset({".obj", ".stl", ".msh", ".dae", ".mtl", ".png", ".jpg", ".jpeg"})
 """Meshes and textures, of which name and size count: robosuite has half a gigabyte of them."""
+HARNESS = Path(__file__).resolve().parent
+"""This package, which has a sum of its own."""
 
 
 def digest(module: str) -> str | None:
     """SHA-256 of an imported module's source, with that of the modules beside it that it imported.
 
-    A package counts as a whole. What lies elsewhere is a library (`sums`). None for a module without a source file.
+    A package counts as a whole. What lies elsewhere is a library (`sums`), and so is what is installed below the folder
+    in a virtual environment. None for a module without a source file.
     """
     file = _file(module)
     if file is None:
@@ -33,13 +36,20 @@ def digest(module: str) -> str | None:
     mine = {file}
     if folder.name != "site-packages":
         loaded = (_file(name) for name in list(sys.modules))
-        mine |= {each for each in loaded if each is not None and folder in each.parents}
+        mine |= {each for each in loaded if each is not None and _beside(folder, each)}
     total = hashlib.sha256()
     for each in sorted(mine):
         content = each.read_bytes()
         total.update(f"{each.relative_to(folder).as_posix()} {len(content)}\n".encode())
         total.update(content)
     return total.hexdigest()
+
+
+def _beside(folder: Path, file: Path) -> bool:
+    """Whether a file lies below a folder and is neither installed there nor this package's."""
+    if folder not in file.parents or HARNESS in file.parents:
+        return False
+    return "site-packages" not in file.relative_to(folder).parts
 
 
 def sums(names: Iterable[str]) -> dict[str, str]:

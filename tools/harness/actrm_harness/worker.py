@@ -282,6 +282,7 @@ def episode_reply(kind: str, number: int, episode: Episode) -> wire.Message:
         "success": verdict(episode.success),
         "steps": episode.steps,
         "attrs": episode.attrs,
+        "failure": episode.failure,
         "progress": episode.progress,
     }
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from toy_simulator import Slide
 
-from actrm_harness.simulators import Description, Initial, Options, Stepped
+from actrm_harness.simulators import Description, Episode, Initial, Options, Stepped
 from actrm_harness.tasks import Task, register
-from actrm_harness.wire import Array
+from actrm_harness.wire import Array, Tensors
 
 
 @dataclass
@@ -53,6 +53,14 @@ class Odd(Slide):
         }
         return replace(done, **odd.get(self.task, {}))
 
+    def expert(self, seed: int, demonstration: bool, expert: str | None = None, skill: str | None = None) -> Episode:
+        """One that is lost in its fourth step, half way."""
+        if self.task != "ExpertLoses":
+            return super().expert(seed, demonstration, expert, skill)
+        nothing = np.zeros(4)
+        tensors: Tensors = {"actions": nothing[:, None], "rewards": nothing, "dones": np.array([0, 0, 0, 1])}
+        return Episode(False, 4, {}, tensors, 0.5, "fell")
+
 
 def start(options: Options) -> Odd:
     """The simulation of a task."""
@@ -70,6 +78,7 @@ NAMES = (
     "NanSuccess",
     "NanProgress",
     "NanSeen",
+    "ExpertLoses",
 )
 for name in NAMES:
     register(Task(name, simulator=__name__, max_steps=30))

@@ -10,13 +10,15 @@ import numpy as np
 import pytest
 from conftest import LIBRARY, Client
 
+from actrm_harness.protocol import RequestError
+from actrm_harness.simulators import Episode
 from actrm_harness.simulators.robosuite import suite
 
 suite.prepare()
 
 from actrm_harness.simulators.robosuite import control, envs, episodes  # noqa: E402
 from actrm_harness.simulators.robosuite.control import CompiledControl  # noqa: E402
-from actrm_harness.simulators.robosuite.control_abi import Library  # noqa: E402
+from actrm_harness.simulators.robosuite.control_abi import Library, check  # noqa: E402
 from actrm_harness.wire import Array  # noqa: E402
 
 TASKS = [
@@ -394,11 +396,48 @@ def test_what_env_step_refuses_is_refused(lift: Any) -> None:
         compiled.step(np.zeros(7))
 
 
+def test_a_diverged_simulation_is_the_environments_error_and_bad_arguments_are_ours(
+    lift: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    # MuJoCo writes a log where it is
+    monkeypatch.chdir(tmp_path)
+    compiled = attached(lift)
+    seeded(lift, 1)
+    lift.sim.model._model.dof_armature[:] = -100.0
+    with pytest.raises(RequestError, match="diverged") as caught:
+        compiled.step(np.zeros(7))
+    assert caught.value.kind == "environment"
+    with pytest.raises(control.ControlError, match="status 2"):
+        check(Library(LIBRARY).run(None, None, None, 1, 0))
+
+
+def test_what_is_extracted_does_not_depend_on_what_was_extracted_before() -> None:
+    """Stack's reward asks for contacts: those of this demonstration's simulation, and not of the one before."""
+
+    def session() -> envs.Session:
+        made = envs.make("Stack")
+        made.control = attached(made.env)
+        # as a worker does before it greets
+        envs.reset(made, 0)
+        return made
+
+    def extracted(one: envs.Session, demo: Episode) -> Episode:
+        return episodes.extract(one, demo.tensors["states"], demo.tensors["actions"], demo.attrs["model_file"])
+
+    shown = session()
+    first, second = (episodes.expert_episode(shown, seed) for seed in (1_000_000, 1_000_001))
+    together = session()
+    extracted(together, first)
+    found, alone = extracted(together, second), extracted(session(), second)
+    assert np.array_equal(alone.tensors["rewards"][:-1], second.tensors["rewards"][:-1])
+    assert_same_bits(found.tensors, alone.tensors)
+
+
 def test_other_controllers_keep_robosuites_loop_and_are_named_once(capfd: pytest.CaptureFixture[str]) -> None:
     robosuite = suite.robosuite()
-    config = suite.panda_controller()
+    config = suite.controllers(None, "Panda")
     config["body_parts"]["right"] |= {"type": "JOINT_POSITION", "output_max": 0.05, "output_min": -0.05}
-    absolute = suite.panda_controller()
+    absolute = suite.controllers(None, "Panda")
     absolute["body_parts"]["right"]["input_type"] = "absolute"
     plain = {"has_renderer": False, "has_offscreen_renderer": False, "use_camera_obs": False}
     for kwargs, reason in (

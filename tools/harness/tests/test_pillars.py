@@ -1,11 +1,13 @@
 """RoundPillar: the expert takes either side, the middle is lost, and nothing touches the pillar."""
 
+import dataclasses
 from typing import Any
 
 import numpy as np
 
-from actrm_harness.simulators.robosuite import envs, suite
+from actrm_harness.simulators.robosuite import envs, episodes, suite
 from actrm_harness.tasks import find, row
+from actrm_harness.wire import Array
 
 suite.prepare()
 
@@ -46,3 +48,37 @@ def test_both_sides_lead_to_the_goal_and_straight_on_does_not() -> None:
             break
     assert failures[-1] == "struck"
     env.close()
+
+
+class StraightOn:
+    """An expert that knows of no pillar."""
+
+    def __init__(self, scene: Any, rng: np.random.Generator) -> None:
+        del rng
+        self.env = scene.env
+
+    def act(self) -> Array:
+        """Half of the speed, to the goal."""
+        ahead = self.env.goal - self.env.hand()
+        return np.concatenate([ahead / np.linalg.norm(ahead) * 0.5, np.zeros(4)])
+
+
+def test_an_experts_episode_says_why_it_was_lost() -> None:
+    session = envs.make("RoundPillar")
+    session.task = dataclasses.replace(session.task, expert=StraightOn)
+    lost = episodes.expert_episode(session, 3, demonstration=False)
+    assert (lost.success, lost.failure, lost.progress) == (False, "struck", 0.0)
+    session.env.close()
+
+
+def test_extract_reads_pillar_and_goal_back() -> None:
+    """States do not hold them; the demonstration's model does, with six digits."""
+    session = envs.make("RoundPillar")
+    demo = episodes.expert_episode(session, 1_000_003)
+    assert demo.success and demo.failure is None
+    again = episodes.extract(session, demo.tensors["states"], demo.tensors["actions"], demo.attrs["model_file"])
+    for name in ("rewards", "dones"):
+        assert np.array_equal(again.tensors[name][:-1], demo.tensors[name][:-1]), name
+    for name in ("obs/pillar_pos", "obs/goal_pos"):
+        assert np.abs(again.tensors[name] - demo.tensors[name]).max() < 1e-6, name
+    session.env.close()

@@ -128,6 +128,16 @@ def test_another_simulator_is_a_module() -> None:
     client.close()
 
 
+def test_a_simulator_may_lie_in_a_package(tmp_path: Path) -> None:
+    (tmp_path / "world").mkdir()
+    (tmp_path / "world/__init__.py").write_text("")
+    (tmp_path / "world/sim.py").write_text((HERE / "toy_simulator.py").read_text())
+    paths = {"PYTHONPATH": f"{tmp_path}:{HERE.parent}"}
+    client = Client("--task", "Slide", "--env-module", "world.sim", env=paths)
+    assert (client.ready["simulator"], "world" in client.ready["sources"]) == ("world.sim", True)
+    client.close()
+
+
 def test_a_modules_sum_says_what_it_says(tmp_path: Path) -> None:
     """With what it imports from beside it; not with what merely lies there."""
 

@@ -4,19 +4,19 @@ import dataclasses
 from collections import Counter
 from collections.abc import Generator
 from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
-import plain_experts
 import pytest
 from conftest import Client, WorkerError
 
-from actrm_harness.check_experts import BARS, LESS_ABLE
-from actrm_harness.experts import arms, cubes, objects, picks, pillars
+from actrm_harness.check_experts import BARS, LESS_ABLE, Outcome, read, write
 from actrm_harness.experts.parts import Scene
 from actrm_harness.experts.skills import SHOWN_BY, SKILLS, Demonstrator
 from actrm_harness.protocol import RequestError
 from actrm_harness.simulators import Episode
 from actrm_harness.simulators.robosuite import control, envs, episodes, suite
+from actrm_harness.tasks import find
 from actrm_harness.wire import Array
 
 suite.prepare()
@@ -41,24 +41,13 @@ def shown(session: envs.Session, seed: int, skill: str | None) -> Episode:
 
 @pytest.mark.usefixtures("library")
 @pytest.mark.parametrize("task", [*SHOWN, "StackThreeCubes", "PickAny", "RoundPillar", "TwoArmLift"])
-def test_a_good_demonstrator_shows_what_was_shown_before_bit_for_bit(
-    task: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with driven(task) as session:
-        session.task = dataclasses.replace(session.task, max_steps=200)
-        seeds = (FIRST, FIRST + 7)
-        usual = [shown(session, seed, skill) for seed, skill in zip(seeds, (None, "good"), strict=True)]
-        assert all("skill" not in episode.attrs for episode in usual)
-        for module in (arms, cubes, objects, picks, pillars):
-            monkeypatch.setattr(module, "Servo", plain_experts.PlainServo)
-            monkeypatch.setattr(module, "Grasp", plain_experts.PlainGrasp, raising=module is not pillars)
-        if task == "Door":
-            place = plain_experts.PlainDoorExpert
-            session.task = dataclasses.replace(session.task, expert=place)
-        before = [shown(session, seed, None) for seed in seeds]
-    for now, then in zip(usual, before, strict=True):
-        assert now.tensors.keys() == then.tensors.keys()
-        assert all(now.tensors[name].tobytes() == then.tensors[name].tobytes() for name in now.tensors)
+def test_a_good_demonstrator_shows_what_was_shown_before(task: str) -> None:
+    """Shipped results are of these demonstrations: a change here is a change of all of them."""
+    with np.load(Path(__file__).with_name("demonstrations.npz")) as before, driven(task) as session:
+        shown_now = shown(session, FIRST, None)
+        assert "skill" not in shown_now.attrs
+        # stored as float16; another kind of processor moves actions by some thousandths
+        np.testing.assert_allclose(shown_now.tensors["actions"], before[task], atol=0.01)
 
 
 def test_mixed_draws_all_kinds_from_the_episodes_seed_and_poor_is_always_poor() -> None:
@@ -162,6 +151,17 @@ def test_what_has_one_skill_only_is_not_called_another() -> None:
             assert caught.value.kind == "no_skill"
 
 
+@pytest.mark.parametrize("task", ["TwoArmLift", "TwoArmHandover", "TwoArmPegInHole", "TwoArmTransport"])
+def test_both_arms_move_in_the_demonstrators_manner(task: str) -> None:
+    session = envs.make(task)
+    envs.reset(session, FIRST)
+    shown_by = Demonstrator.draw("poor", FIRST)
+    assert session.task.expert is not None
+    find(session.task.expert)(Scene(session.env, shown_by=shown_by), np.random.default_rng(0))
+    assert shown_by.arms == 2
+    session.env.close()
+
+
 def test_a_worker_takes_skills_and_refuses_unknown_ones_by_name(lift: Client) -> None:
     for unknown in ("careless", ""):
         with pytest.raises(WorkerError, match=r"no_skill: unknown skill .*known: good, mixed, poor") as caught:
@@ -178,3 +178,15 @@ def test_a_worker_takes_skills_and_refuses_unknown_ones_by_name(lift: Client) ->
 
 def test_the_bar_of_less_able_demonstrators_is_not_above_any_tasks() -> None:
     assert all(bar >= LESS_ABLE for bar in BARS.values())
+
+
+def test_counting_goes_on_after_a_line_that_was_cut_off(tmp_path: Path) -> None:
+    out = tmp_path / "outcomes.jsonl"
+    outcomes = [Outcome("Lift", "compiled", FIRST + k, True, 50, 2) for k in range(3)]
+    for outcome in outcomes[:2]:
+        write(out, outcome)
+    out.write_bytes(out.read_bytes()[:-20])
+    assert read(out) == outcomes[:1]
+    for outcome in outcomes[1:]:
+        write(out, outcome)
+    assert read(out) == outcomes

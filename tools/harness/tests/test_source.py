@@ -66,3 +66,27 @@ def test_modules_that_were_imported_from_elsewhere_count(tmp_path: Path) -> None
     (tmp_path / "other_rules.py").write_text("HEIGHT = 0.05\n")
     swapped = "import sys, other_rules\nsys.modules['world.rules'] = other_rules"
     assert imported(tmp_path, "world", swapped) != imported(tmp_path, "world")
+
+
+def test_a_modules_sum_is_not_of_what_is_installed_below_its_folder(tmp_path: Path) -> None:
+    """As where a module lies in the folder of a repository: with a virtual environment in it, and the harness."""
+    installed, harness = tmp_path / ".venv/lib/site-packages", tmp_path / "tools/actrm_harness"
+    for folder in (installed, harness):
+        folder.mkdir(parents=True)
+    for name in ("__init__.py", "source.py"):
+        (harness / name).write_text((HARNESS / "actrm_harness" / name).read_text())
+    (installed / "library.py").write_text("")
+    (tmp_path / "rules.py").write_text("")
+    (tmp_path / "mine.py").write_text("import library, rules\n")
+
+    def digest() -> str:
+        command = [sys.executable, "-c", "import mine; from actrm_harness import source; print(source.digest('mine'))"]
+        paths = {"PYTHONPATH": f"{tmp_path}:{installed}:{harness.parent}"}
+        return subprocess.run(command, env=paths, capture_output=True, text=True, check=True).stdout
+
+    first = digest()
+    for name in (installed / "library.py", harness / "__init__.py"):
+        name.write_text("# another\n")
+        assert digest() == first, name
+    (tmp_path / "rules.py").write_text("# another\n")
+    assert digest() != first

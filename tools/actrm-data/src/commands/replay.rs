@@ -13,6 +13,9 @@ use std::process::ExitCode;
 /// Steps that a worker is asked to draw at a time.
 const PART: usize = 32;
 
+/// The task whose states do not say what was done before: robosuite counts what is wiped as it looks at one after the other.
+const COUNTS_ON: &str = "Wipe";
+
 /// Show a demonstration as a video, by setting its recorded states in the simulator one after the other.
 ///
 /// This works for robomimic files and raw robosuite recordings, and for converted data sets whose side folder `actrm/` keeps the
@@ -34,7 +37,7 @@ pub struct Args {
     #[arg(long, value_name = "NAME", default_value = "agentview")]
     camera: String,
     /// Side of the images, in pixels: an even number
-    #[arg(long, default_value_t = 256, value_parser = clap::value_parser!(u16).range(16..=1024))]
+    #[arg(long, default_value_t = 256, value_parser = cli::limits::video_side::<1024>)]
     size: u16,
     #[command(flatten)]
     simulator: SimulatorArgs,
@@ -75,8 +78,9 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let mut video = VideoWriter::begin(&args.video, size, rate)?;
     let mut screen = Screen::new();
     screen.begin(format!("drawing {id}"), steps as u64);
-    let parts = steps.div_ceil(PART);
-    let part = |job: u64| job as usize * PART..steps.min((job as usize + 1) * PART);
+    let length = if task == COUNTS_ON { steps } else { PART };
+    let parts = steps.div_ceil(length);
+    let part = |job: u64| job as usize * length..steps.min((job as usize + 1) * length);
     let work = |(): &mut (), worker: &mut Worker, job: u64| {
         let Recording { model, ep_meta, states, actions } = &recording;
         // and the next part's first, which is looked at as it was recorded: what follows the last is simulated

@@ -51,6 +51,18 @@ class RoundPillar(OnTable, Stack):
             body.append(_Xml.new_geom(name=f"{name}_geom", size=size, **look))
             arena.worldbody.append(body)
 
+    def _reset_internal(self) -> None:
+        super()._reset_internal()
+        if self.deterministic_reset:
+            # a model that was recorded: where they stand is all that is left of what was drawn
+            self.sim.forward()
+            self.pillar, self.goal = self._stands("pillar"), self._stands("goal_mark")
+
+    def _stands(self, name: str) -> Array:
+        """Where a body of the model is, at the height of the hand."""
+        place = self.sim.model.body_pos[self.sim.model.body_name2id(name)]
+        return np.array([place[0], place[1], self.hand()[2]])
+
     def arrange(self) -> None:
         """Put the pillar in front of the hand and the goal behind it."""
         self.sim.forward()

@@ -223,7 +223,7 @@ class TwoArmTransportExpert(_HandingExpert):
 
     def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
         # the first reaches into a bin for the hammer
-        super().__init__(scene, Scene(scene.env, 1), rng, scene.task.transport.payload, tall=0.19)
+        super().__init__(scene, Scene(scene.env, 1, scene.shown_by), rng, scene.task.transport.payload, tall=0.19)
         style = self.servos[0].style
         self.lid = Grasp(scene, style, tall=0.02, mouth=(0.012, 0.03))
         self.trash = Grasp(self.scenes[1], style, tall=0.19, mouth=(0.012, 0.04))

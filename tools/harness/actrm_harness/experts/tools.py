@@ -17,9 +17,8 @@ from actrm_harness.experts.parts import (
 )
 from actrm_harness.wire import Array
 
-# In the frame's own axes, where z leads up its rod and -x along the hook: where it is held, and from there to the tip.
+# In the frame's own axes, where z leads up its rod and -x along the hook: where it is held.
 GRIP = np.array([0.04375, 0.0, 0.0525])
-ROD = 0.187
 
 # How far the hand leans when it takes the frame: half of the quarter turn that stands the frame up is made before, so
 # that the hand points down as much as it did when it lets go.

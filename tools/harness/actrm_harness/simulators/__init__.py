@@ -114,6 +114,8 @@ class Episode:
     tensors: Tensors
     progress: float | None = None
     """Which share of its way it came before the task was solved, 1 if it was; where stages are known."""
+    failure: str | None = None
+    """In a word why the task could no longer be solved, where that ended the episode."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,4 +213,6 @@ def prepare(simulator: str) -> None:
 
 def _module(simulator: str) -> Any:
     own = f"{__name__}.{simulator}"
-    return importlib.import_module(own if importlib.util.find_spec(own) else simulator)
+    # one in a package is none of ours
+    ours = "." not in simulator and importlib.util.find_spec(own) is not None
+    return importlib.import_module(own if ours else simulator)

@@ -13,7 +13,14 @@ from typing import Any
 import numpy as np
 
 from actrm_harness.simulators.robosuite.control import LIBRARY, binding
-from actrm_harness.simulators.robosuite.control_abi import STATE, ArmBinding, ControlError, Library, mujoco_functions
+from actrm_harness.simulators.robosuite.control_abi import (
+    STATE,
+    ArmBinding,
+    ControlError,
+    Library,
+    check,
+    mujoco_functions,
+)
 from actrm_harness.wire import Array
 
 _SNAPSHOT = {
@@ -122,8 +129,7 @@ class Loop:
         for substep in range(self._substeps):
             fingers = robot.gripper.format_action(action[6:])
             data.ctrl[self._fingers] = self._bias + self._weight * fingers
-            if self._library.run(self._handle, *self._places, 1, 0) != 0:
-                raise ControlError("the simulation has diverged: the arm's inertia matrix is not positive definite")
+            check(self._library.run(self._handle, *self._places, 1, 0))
             if not at_once or substep == self._substeps - 1:
                 env._update_observables()
         arm.new_update = True

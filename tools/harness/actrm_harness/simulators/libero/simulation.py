@@ -4,7 +4,8 @@ An episode is (suite, task, initial state). Seed k takes initial state k modulo 
 that LIBERO gives when it is made, seeded with `SEED` and reset once: that seed places the fixtures, the initial state
 does not. Then come `SETTLING` steps without action and with an open gripper.
 
-Seeds from `DRAWN` on, and demonstrations, have initial states that LIBERO draws, as it once drew its fixed ones.
+Seeds from `DRAWN` on, and demonstrations, have initial states that LIBERO draws, as it once drew its fixed ones. The
+seed is the one of the task: of a suite of n tasks (`family`), these are the seeds from n times `DRAWN` on.
 """
 
 import copy

@@ -23,6 +23,7 @@ from actrm_harness.simulators.robosuite.control_abi import (
     Binding,
     ControlError,
     Library,
+    check,
     mujoco_functions,
 )
 from actrm_harness.simulators.robosuite.control_known import robosuite_class, unknown
@@ -182,9 +183,7 @@ class CompiledControl:
         return self._observations()
 
     def _run(self, substeps: int, policy_step: bool) -> None:
-        status = self._library.run(self._handle, *self._addresses, substeps, policy_step)
-        if status != 0:
-            raise ControlError("the simulation has diverged: the arm's inertia matrix is not positive definite")
+        check(self._library.run(self._handle, *self._addresses, substeps, policy_step))
         for robot in self._robots:
             robot.stepped()
 

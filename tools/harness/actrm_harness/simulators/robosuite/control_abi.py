@@ -7,11 +7,13 @@ from typing import Any, cast
 
 import numpy as np
 
+from actrm_harness.protocol import RequestError
 from actrm_harness.wire import Array
 
 MUJOCO = "3.3.7"
 DOF = 7
 ABI = 2
+DONE, DIVERGED = 0, 1
 
 _GRIP_SITE = [("ref_pos", "f8", 3), ("ref_ori", "f8", (3, 3)), ("ref_pos_vel", "f8", 3), ("ref_ori_vel", "f8", 3)]
 
@@ -106,6 +108,15 @@ class Library:
         out = np.empty((3, 3))
         self._delta_rotation(axis.ctypes.data, out.ctypes.data)
         return out
+
+
+def check(status: int) -> None:
+    """What a run ended with, `Status` of crates/control/src/substeps.rs; RequestError where the simulation diverged."""
+    if status == DIVERGED:
+        text = "the simulation has diverged: the arm's inertia matrix is not positive definite"
+        raise RequestError("environment", text)
+    if status != DONE:
+        raise ControlError(f"the control library refuses what it was given (status {status})")
 
 
 def _typed(function: Any, result: Any, *arguments: Any) -> Any:

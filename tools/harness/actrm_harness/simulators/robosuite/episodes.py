@@ -89,7 +89,7 @@ def expert_episode(
     recorder = Recorder(envs.reset(session, seed, demonstration), whole=False)
     attrs = {"model_file": envs.model_xml(env), "ep_meta": json.dumps(env.get_ep_meta())}
     expert: Expert = find(place)(Scene(env, shown_by=shown_by), np.random.default_rng([seed, 1]))
-    held = 0
+    held, failure = 0, None
     mistakes: list[bool] = []
     for _ in range(session.task.max_steps):
         before = envs.state(env)
@@ -98,8 +98,8 @@ def expert_episode(
         recorder.add(before, action, result)
         if isinstance(expert, Marking):
             mistakes.append(expert.erring)
-        held = held + 1 if result.success else 0
-        if held > STEPS_AFTER_SUCCESS or result.failure is not None:
+        held, failure = held + 1 if result.success else 0, result.failure
+        if held > STEPS_AFTER_SUCCESS or failure is not None:
             break
     if skill not in (None, USUAL):
         if shown_by.arms == 0:
@@ -110,7 +110,7 @@ def expert_episode(
     tensors = recorder.tensors()
     if mistakes:
         tensors["mistakes"] = np.array(mistakes, dtype=np.int64)
-    return Episode(recorder.successes[-1], len(recorder.actions), attrs, tensors, progress)
+    return Episode(recorder.successes[-1], len(recorder.actions), attrs, tensors, progress, failure)
 
 
 def _expert_place(session: Session, name: str | None) -> Any:
@@ -144,6 +144,8 @@ def extract(
     envs.check_actions(env, actions)
     env.hard_reset |= session.xml_forgotten
     session.foreign_model = True
+    if session.control is not None:
+        session.control.release()
     env.set_ep_meta(dict(ep_meta or {}))
     # what a reset draws and the demonstration does not hold must not depend on what this worker did before
     env.rng.bit_generator.state = np.random.default_rng(0).bit_generator.state

@@ -112,11 +112,6 @@ def known_environments() -> list[str]:
     return sorted(cast("dict[str, Any]", importlib.import_module("robosuite.environments.base").REGISTERED_ENVS))
 
 
-def panda_controller() -> dict[str, Any]:
-    """Robosuite's default controller configuration of the Panda: BASIC with OSC_POSE and the gripper."""
-    return _default_controller("Panda")
-
-
 def controllers(config: Any, robot: str) -> Any:
     """A controller configuration, or one for each robot, in the form that robosuite 1.5 wants; None: the default.
 
