@@ -108,7 +108,7 @@ than six separate ones. The tables are computed from the stored results (`make r
 
 ## Success per task and input
 
-Success on 200 test seeds after 200 scripted demonstrations. State: mean of three trainings. Images: one training, two cameras.
+Success on 200 test seeds after 200 scripted demonstrations. State: mean of three trainings. Images: one training (StackThreeCubes: up to three), two cameras.
 
 {short}
 ¹ With an auxiliary loss on object positions and mirrored samples; StackColor also with goal-dependent colour channels. ² With the auxiliary

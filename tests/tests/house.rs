@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use e2e::options::options_page;
 use e2e::reference::assert_current;
 use e2e::results::results_page;
+use e2e::{succeeds, text, zoo};
 
 fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..").canonicalize().expect("the repository is there")
@@ -246,6 +247,32 @@ fn the_reference_of_options_is_current() {
         }
     }
     assert!(seen > 1000, "{seen}");
+}
+
+/// Every page of a study with its charts, written anew in a folder where the results are links.
+#[test]
+fn the_reference_of_studies_is_current() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let results = folder.path().join("docs/results");
+    for file in files(&root().join("docs/results"), "json") {
+        let link = folder.path().join(file.strip_prefix(root()).expect("below the root"));
+        fs::create_dir_all(link.parent().expect("a folder")).expect("a folder can be made");
+        std::os::unix::fs::symlink(&file, &link).expect("a link can be made");
+    }
+    std::os::unix::fs::symlink(root().join("studies"), folder.path().join("studies")).expect("a link can be made");
+    let mut pages = 1;
+    for study in files(&root().join("studies"), "toml") {
+        let study = Path::new("studies").join(study.file_name().expect("a name"));
+        succeeds(zoo(["study", text(&study), "--page-only"]).current_dir(&folder));
+        pages += 1;
+    }
+    succeeds(zoo(["study", "--page-only", "--page", "docs/results/puzzles.md"]).current_dir(&folder));
+    let written = [files(&results, "md"), files(&results, "svg")];
+    assert_eq!(written[0].len(), pages, "{written:?}");
+    for file in written.iter().flatten() {
+        let page = file.strip_prefix(&folder).expect("in the folder");
+        assert_current(text(page), &fs::read_to_string(file).expect("text"));
+    }
 }
 
 #[test]

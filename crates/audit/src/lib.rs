@@ -281,14 +281,16 @@ pub fn is_of(folder: &Path, id: &EntryId) -> bool {
     name.starts_with(&format!("{id}_")) || entries_named(folder).into_iter().any(is)
 }
 
+/// The record of an evaluation on puzzles.
+const PUZZLES: &str = "puzzles.json";
+
 /// A file that only a result has, in a folder without any record.
 fn unexplained(folder: &Path) -> Option<&'static str> {
-    // other kinds of entries leave records of other names, which are read elsewhere
-    let other = |name: &str| name.ends_with(".json") && name != SEAL_FILE;
     let names = folder.read_dir().ok()?.flatten().filter_map(|item| item.file_name().into_string().ok());
     let names: Vec<String> = names.collect();
     let tables = [OUTCOMES, SEAL_FILE].into_iter().find(|name| names.iter().any(|found| found == name));
-    tables.filter(|_| !names.iter().any(|name| other(name)))
+    // evaluations on puzzles have a record of another name, which is read elsewhere
+    tables.filter(|_| !folder.join(PUZZLES).is_file())
 }
 
 /// The finished evaluation in `folder`; nothing if it is still under way.
@@ -477,6 +479,12 @@ mod tests {
         fs::remove_file(&mine).unwrap();
         assert!(reason(zoo.path()).contains("outcomes.parquet"));
         fs::write(&mine, honest).unwrap();
+
+        // its record under another name
+        let hidden = folder.join("evaluation.json.bak.json");
+        fs::rename(folder.join(RECORD), &hidden).unwrap();
+        assert!(reason(zoo.path()).contains("a result without evaluation.json"));
+        fs::rename(&hidden, folder.join(RECORD)).unwrap();
 
         // a seal taken away, or of another folder
         let seal = fs::read(folder.join(SEAL_FILE)).unwrap();

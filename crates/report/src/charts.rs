@@ -16,7 +16,7 @@ pub(super) fn intervals(rows: &[&LeaderboardRow], palette: &Palette) -> String {
     let scale = |rate: f64| left + rate * (WIDTH - left - right);
     let height = 16.0 + step * rows.len() as f64 + 26.0;
     let bottom = height - 26.0;
-    let mut svg = open(height, "Success rate of each entry with its 95% Wilson interval");
+    let mut svg = open(height, "Success rate of each entry with its 95% interval");
     for percent in (0..=100).step_by(20) {
         let x = scale(f64::from(percent) / 100.0);
         let _ = write!(
@@ -54,12 +54,13 @@ pub(super) fn intervals(rows: &[&LeaderboardRow], palette: &Palette) -> String {
 pub(super) fn costs(rows: &[&LeaderboardRow], palette: &Palette) -> String {
     type Cost = fn(&LeaderboardRow) -> f64;
     let measures: [(&str, Cost); 3] = [
-        ("median query, ms", |row| row.inference_ms().0),
+        ("median query, ms", |row| row.inference_ms().map_or(0.0, |(median, _)| median)),
         ("weights", |row| row.record().training.parameters as f64),
         ("minutes of training", LeaderboardRow::minutes),
     ];
     let drawn: String = measures.iter().map(|(name, cost)| cost_chart(rows, palette, name, cost)).collect();
-    let mut policies: Vec<(&str, &str)> = rows.iter().map(|row| (row.policy(), palette.colour(row))).collect();
+    let trained = rows.iter().filter(|row| row.is_trained());
+    let mut policies: Vec<(&str, &str)> = trained.map(|row| (row.policy(), palette.colour(row))).collect();
     policies.sort_unstable();
     policies.dedup();
     let legend: String = policies
@@ -166,12 +167,13 @@ fn cost_chart(
         let colour = palette.colour(row);
         let _ = write!(
             svg,
-            r#"<circle cx="{:.1}" cy="{:.1}" r="5" fill="{colour}" fill-opacity=".75"><title>{} ({}): {}, {x:.2} {}</title></circle>"#,
+            r#"<circle cx="{:.1}" cy="{:.1}" r="5" fill="{colour}" fill-opacity=".75"><title>{} ({}): {}, {} {}</title></circle>"#,
             x_of(x),
             y_of(row.counts.rate()),
             escape(&row.name()),
             escape(row.policy()),
             row.counts.percent(1),
+            cost_text(x),
             escape(name)
         );
     }

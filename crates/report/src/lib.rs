@@ -28,4 +28,4 @@ pub use page::{
     Beside, Curve, DEPTH_COLUMNS, Depth, EntryFacts, Film, MOST_FILM_BYTES, OTHERS_COLUMNS, Places, shell_quoted,
     to_html,
 };
-pub use statistics::{mean, percent, quantile, wilson_interval};
+pub use statistics::{mean, percent, quantile, share_percent, wilson_interval};

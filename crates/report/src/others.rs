@@ -70,10 +70,15 @@ const KNOWN: &str = "LeRobot's eval_info.json, a result file of vla-eval, or a C
 /// A form that is not known; a value that is missing or of another kind; an episode that is there twice.
 pub fn parse(file: &str, text: &str) -> Result<Vec<Run>, Unreadable> {
     let failed = |what: String| Unreadable { file: file.to_owned(), what };
-    let text = text.trim_start_matches('\u{feff}').trim_start();
+    let whole = text.trim_start_matches('\u{feff}');
+    let text = whole.trim_start();
     let mut runs = Runs::default();
-    let stem = file.rsplit(['/', '\\']).next().unwrap_or(file);
-    let policy = stem.rsplit_once('.').map_or(stem, |(stem, _)| stem);
+    let mut names = file.rsplit(['/', '\\']);
+    let name = names.next().unwrap_or(file);
+    let stem = name.rsplit_once('.').map_or(name, |(stem, _)| stem);
+    // LeRobot names every file so: the folder tells policies apart
+    let folder = names.next().filter(|folder| stem == "eval_info" && !["", ".", ".."].contains(folder));
+    let policy = folder.unwrap_or(stem);
     if text.starts_with(['{', '[']) {
         let value: Value =
             serde_json::from_str(&plain_json(text)).map_err(|error| failed(format!("not JSON: {error}")))?;
@@ -85,7 +90,8 @@ pub fn parse(file: &str, text: &str) -> Result<Vec<Run>, Unreadable> {
         };
         read.map_err(failed)?;
     } else {
-        csv(text, &mut runs).map_err(failed)?;
+        let above = whole[..whole.len() - text.len()].matches('\n').count() as u64;
+        csv(text, above + 1, &mut runs).map_err(failed)?;
     }
     let runs: Vec<Run> = runs.0.into_values().collect();
     if runs.iter().all(|run| run.outcomes.is_empty()) {
@@ -152,7 +158,7 @@ fn vla_eval(value: &Value, policy: &str, runs: &mut Runs) -> Result<(), String> 
             };
             let run = runs.run(name, policy, By::VlaEval);
             run.partial = partial;
-            run.errors += u64::from(error);
+            run.errors += u64::from(error && !success);
             run.add(number, success)?;
         }
     }
@@ -189,13 +195,15 @@ fn lerobot_episodes(episodes: &Value, policy: &str, runs: &mut Runs) -> Result<(
     Ok(())
 }
 
-fn csv(text: &str, runs: &mut Runs) -> Result<(), String> {
+/// `first` is the number of the text's first line.
+fn csv(text: &str, first: u64, runs: &mut Runs) -> Result<(), String> {
     let head = text.lines().next().unwrap_or_default();
     let delimiter = [b',', b';', b'\t'].into_iter().find(|byte| head.as_bytes().contains(byte)).unwrap_or(b',');
-    let mut lines = records(text, delimiter).into_iter();
-    let header = lines.next().unwrap_or_default();
+    let mut lines = records(text, first, delimiter).into_iter();
+    let header = lines.next().map(|(_, cells)| cells).unwrap_or_default();
     let column = |name: &str| header.iter().position(|cell| cell.trim().eq_ignore_ascii_case(name));
-    let missing = |name: &str| format!("line 1: no column `{name}`, found {}; expected {KNOWN}", header.join(", "));
+    let missing =
+        |name: &str| format!("line {first}: no column `{name}`, found {}; expected {KNOWN}", header.join(", "));
     let need = |name: &str| column(name).ok_or_else(|| missing(name));
     let (task, policy, success) = (need("task")?, need("policy")?, need("success")?);
     let (number, by) = match (column("seed"), column("episode")) {
@@ -203,7 +211,7 @@ fn csv(text: &str, runs: &mut Runs) -> Result<(), String> {
         (None, Some(episode)) => (episode, By::Order),
         (None, None) => return Err(missing("seed")),
     };
-    for (line, cells) in (2..).zip(lines) {
+    for (line, cells) in lines {
         let cell = |at: usize| cells.get(at).map(|cell| cell.trim()).filter(|cell| !cell.is_empty());
         let need = |at: usize| cell(at).ok_or_else(|| format!("line {line}: no {}", header[at].trim()));
         let wrong = |at: usize, expected: &str, found: &str| {
@@ -223,15 +231,19 @@ fn csv(text: &str, runs: &mut Runs) -> Result<(), String> {
     Ok(())
 }
 
-/// The records of a CSV; empty lines are none.
-fn records(text: &str, delimiter: u8) -> Vec<Vec<String>> {
+/// The records of a CSV with the line at which each begins; empty lines are none.
+fn records(text: &str, first: u64, delimiter: u8) -> Vec<(u64, Vec<String>)> {
     let mut reader = ReaderBuilder::new().delimiter(delimiter).build();
     let mut input = text.as_bytes();
     let (mut all, mut cells) = (Vec::new(), vec![0; text.len().max(1)]);
     // a record has at most one cell more than its line has bytes
     let mut ends = vec![0; 64];
+    let (mut line, newlines) = (first, |part: &[u8]| part.iter().filter(|byte| **byte == b'\n').count() as u64);
     loop {
-        let (mut written, mut count) = (0, 0);
+        let empty = input.iter().take_while(|byte| b"\r\n".contains(byte)).count();
+        line += newlines(&input[..empty]);
+        input = &input[empty..];
+        let (begun, mut written, mut count) = (input, 0, 0);
         let finished = loop {
             let (result, read, out, ended) = reader.read_record(input, &mut cells[written..], &mut ends[count..]);
             input = &input[read..];
@@ -252,7 +264,8 @@ fn records(text: &str, delimiter: u8) -> Vec<Vec<String>> {
         let starts = std::iter::once(0).chain(ends[..count].iter().copied());
         let cut =
             starts.zip(&ends[..count]).map(|(start, end)| String::from_utf8_lossy(&cells[start..*end]).into_owned());
-        all.push(cut.collect());
+        all.push((line, cut.collect()));
+        line += newlines(&begun[..begun.len() - input.len()]);
     }
 }
 
@@ -297,9 +310,9 @@ mod tests {
             .map(|run| (run.task.as_str(), run.policy.as_str(), run.outcomes.values().copied().collect()))
             .collect();
         let expected = [
-            ("Lift", "eval_info", vec![true, false]),
-            ("libero_spatial_0", "eval_info", vec![true, false, true]),
-            ("libero_spatial_1", "eval_info", vec![false]),
+            ("Lift", "act", vec![true, false]),
+            ("libero_spatial_0", "act", vec![true, false, true]),
+            ("libero_spatial_1", "act", vec![false]),
         ];
         assert_eq!(found, expected);
         assert!(!runs[0].is_paired(&runs[1]));
@@ -317,11 +330,12 @@ mod tests {
             {"task": "pick", "episodes": [
                 {"episode_id": 0, "metrics": {"success": true}, "steps": 90},
                 {"episode_id": 1, "metrics": {"success": 0.0}, "steps": 90},
-                {"episode_id": 2, "metrics": {}, "failure_reason": "timeout"}
-            ], "num_episodes": 3, "avg_steps": 60.0}], "config": {}}"#;
+                {"episode_id": 2, "metrics": {}, "failure_reason": "timeout"},
+                {"episode_id": 3, "metrics": {"success": true}, "failure_reason": "server disconnected"}
+            ], "num_episodes": 4, "avg_steps": 60.0}], "config": {}}"#;
         let runs = parse("pi0.json", text).unwrap();
         assert_eq!((runs[0].policy.as_str(), runs[0].errors, runs[0].partial), ("pi0", 1, true));
-        assert_eq!(runs[0].outcomes, [(0, true), (1, false), (2, false)].into());
+        assert_eq!(runs[0].outcomes, [(0, true), (1, false), (2, false), (3, true)].into());
         assert!(runs[0].is_paired(&runs[0]));
         let twice = text.replace("\"episode_id\": 1", "\"episode_id\": 0");
         assert_eq!(error("pi0.json", &twice), "pi0.json: task pick, policy pi0: episode 0 is there twice");
@@ -351,6 +365,7 @@ mod tests {
             ),
             ("task,policy,seed,success\nLift,a,-1,1", "line 2: seed: expected an integer from 0 on, found `-1`"),
             ("task,policy,seed,success\nLift,a,1", "line 2: no success"),
+            ("\n\ntask,policy,seed,success\r\n\r\nLift,\"a\nb\",1,1\n\nLift,a,1,maybe", "line 8: success"),
             (
                 "task,policy,seed,success\nLift,a,1,1\nLift,a,1,0",
                 "line 3: task Lift, policy a: episode 1 is there twice",

@@ -28,13 +28,14 @@ impl Rerun {
         by_clock
     }
 
-    /// What simulators are started for.
+    /// What simulators are started for, with the module that the user names.
     ///
     /// # Errors
-    /// As [`Environment::of`].
-    pub fn environment(&self) -> Result<Environment, ZooError> {
+    /// As [`Environment::of`]; the row was measured with a module, and the user names none.
+    pub fn environment(&self, env_module: Option<&str>) -> Result<Environment, ZooError> {
         let protocol = &self.stored.record.protocol;
-        Environment::of(self.entry.meta(), Some(&protocol.task), protocol.env_module.as_deref())
+        let environment = Environment::of(self.entry.meta(), Some(&protocol.task), env_module)?;
+        environment.expecting(&self.stored.folder.display().to_string(), protocol.env_module.as_deref())
     }
 
     /// The policy of `entry`, acting as the row's did.
@@ -175,6 +176,23 @@ fn other_outcomes(stored: &[EpisodeRecord], now: &[EpisodeRecord]) -> Option<Str
 #[cfg(test)]
 mod tests {
     use super::*;
+    use results::testing::{finished, sample};
+    use zoo::entry::testing::draft;
+
+    #[test]
+    fn the_module_of_a_row_is_named_by_the_user() {
+        let zoo = tempfile::tempdir().expect("a temporary folder");
+        let id = draft("lift-act").seal(zoo.path()).expect("an entry");
+        let entry = Entry::open(zoo.path(), &id).expect("an entry");
+        let mut record = sample("lift-act", 1, 5);
+        record.protocol.env_module = Some("theirs".to_owned());
+        let stored = finished(&zoo.path().join("results"), &record);
+        let rerun = Rerun { entry, stored, work: PathBuf::new() };
+        let refused = rerun.environment(None).expect_err("nobody named it").to_string();
+        assert!(refused.contains("lift-act@1") && refused.contains("\"theirs\""), "{refused}");
+        let environment = rerun.environment(Some("mine")).expect("an environment");
+        assert_eq!(environment.env_module.as_deref(), Some("mine"));
+    }
 
     fn episode(seed: u64, success: bool, steps: u32) -> EpisodeRecord {
         let fingerprint = format!("{seed:064x}");

@@ -101,6 +101,11 @@ mod tests {
         ];
         assert_eq!(ranked, expected.map(|(name, rank)| (name.to_owned(), rank)));
         assert!(rank(&all)[5].rate_text().contains("too few to rank"));
+        // a ceiling between two equal rows takes no place
+        let mut ceiling = stored("middle", 199, 200);
+        ceiling.record.training.policy = "expert".to_owned();
+        let ranks = rank(&[all[4].clone(), all[5].clone(), all[6].clone(), ceiling]);
+        assert_eq!(ranks.iter().map(|row| row.rank).collect::<Vec<_>>(), [Some(1), None, Some(1), Some(3)]);
         // another protocol begins anew
         let mut other = all[3].clone();
         other.record.protocol.max_steps = 500;
@@ -455,5 +460,9 @@ mod tests {
         other.record.protocol.max_steps += 1;
         let another = finished(dir.path(), &sample("b", 1, 10));
         assert_eq!(rank(&[all[2].clone(), other, another]).len(), 3);
+        // or drawn by another renderer
+        let mut drawn = all[1].clone();
+        drawn.record.renderer = Some("a GPU".to_owned());
+        assert_eq!(rank(&[all[2].clone(), drawn]).len(), 2);
     }
 }

@@ -48,18 +48,17 @@ pub fn rank(evaluations: &[StoredEvaluation], reading: &Reading) -> Vec<Leaderbo
     let mut grouped: Vec<_> = rows.into_iter().map(|row| (group(&row), row)).collect();
     grouped.sort_by(|(one_group, one), (two_group, two)| one_group.cmp(two_group).then_with(|| order(one, two)));
     let mut rows: Vec<LeaderboardRow> = grouped.into_iter().map(|(_, row)| row).collect();
-    let mut place = 0;
+    let (mut place, mut last) = (0, None);
     for at in 0..rows.len() {
-        let before = at.checked_sub(1).map(|at| &rows[at]).filter(|before| group(before) == group(&rows[at]));
-        // bounds take no place
-        place = match before {
-            None => 1,
-            Some(before) if before.bound().is_some() => place,
-            Some(_) => place + 1,
-        };
+        if rows[at].too_few() || rows[at].bound().is_some() {
+            // takes no place
+            continue;
+        }
+        let before = last.map(|at: usize| &rows[at]).filter(|before| group(before) == group(&rows[at]));
+        place = before.map_or(1, |_| place + 1);
         let same = before.filter(|before| before.counts == rows[at].counts).and_then(|before| before.rank);
-        let ranked = !rows[at].too_few() && rows[at].bound().is_none();
-        rows[at].rank = ranked.then_some(same.unwrap_or(place));
+        rows[at].rank = Some(same.unwrap_or(place));
+        last = Some(at);
     }
     compare_all(&mut rows);
     rows
@@ -181,8 +180,8 @@ fn without_parts(rows: Vec<LeaderboardRow>) -> Vec<LeaderboardRow> {
     let within = |part: &LeaderboardRow, whole: &LeaderboardRow| {
         let (a, b) = (part.record(), whole.record());
         let seeds = b.seeds.start <= a.seeds.start && a.seeds.iter().end <= b.seeds.iter().end && a.seeds != b.seeds;
-        let rules = (&a.protocol, &a.execution, &a.versions, &a.sources)
-            == (&b.protocol, &b.execution, &b.versions, &b.sources);
+        let rules = (&a.protocol, &a.execution, &a.versions, &a.sources, &a.renderer)
+            == (&b.protocol, &b.execution, &b.versions, &b.sources, &b.renderer);
         let entries = part.evaluations().all(|one| whole.evaluations().any(|two| one.record.entry == two.record.entry));
         seeds && rules && part.named.is_none() && entries
     };

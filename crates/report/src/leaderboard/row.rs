@@ -73,8 +73,8 @@ pub struct LeaderboardRow {
     /// How far an episode comes on its way, on average: 1 for those in which the task was done. None where not every
     /// episode says it.
     pub progress: Option<Estimate>,
-    /// Median and 95% quantile of a query's duration in milliseconds.
-    latency: (f64, f64),
+    /// Median and 95% quantile of a query's duration in milliseconds; none where none was asked.
+    latency: Option<(f64, f64)>,
     /// Median durations of what pictures take, in milliseconds; none where the policy sees none.
     seeing: Option<Seeing>,
 }
@@ -185,7 +185,7 @@ impl LeaderboardRow {
         let timings = trainings.iter().flat_map(|one| &one.timings);
         let mut queries: Vec<f64> = timings.flat_map(|t| t.inference_ms.iter().copied()).collect();
         queries.sort_by(f64::total_cmp);
-        let latency = (quantile(&queries, 0.5).unwrap_or(0.0), quantile(&queries, 0.95).unwrap_or(0.0));
+        let latency = quantile(&queries, 0.5).zip(quantile(&queries, 0.95));
         let seeing = Seeing::of(&trainings);
         let (simulator, apart) = (String::new(), String::new());
         let (family, named, rank, standing) = (None, None, None, None);
@@ -324,8 +324,8 @@ impl LeaderboardRow {
         texts.join(" ")
     }
 
-    /// The median duration of a query in milliseconds, and what 95% of them stay below.
-    pub fn inference_ms(&self) -> (f64, f64) {
+    /// The median duration of a query in milliseconds, and what 95% of them stay below; none where none was asked.
+    pub fn inference_ms(&self) -> Option<(f64, f64)> {
         self.latency
     }
 
@@ -342,10 +342,8 @@ impl LeaderboardRow {
     /// `0.6 / 1.2`: median and 95% quantile of a query in milliseconds; nothing where none was asked. Where pictures are seen,
     /// what they take stands in further lines.
     pub(super) fn inference_text(&self, digits: usize) -> String {
-        if self.trainings.iter().flat_map(|one| &one.timings).all(|timing| timing.inference_ms.is_empty()) {
-            return "-".to_owned();
-        }
-        let whole = format!("{:.digits$} / {:.digits$}", self.latency.0, self.latency.1);
+        let Some((median, most)) = self.latency else { return "-".to_owned() };
+        let whole = format!("{median:.digits$} / {most:.digits$}");
         self.seeing.map_or(whole.clone(), |Seeing { rendering, encoding }| {
             format!("{whole}\nencoding {encoding:.digits$}\nrendering +{rendering:.digits$}")
         })
@@ -537,8 +535,8 @@ impl LeaderboardRow {
         if let Some(progress) = self.progress.filter(|progress| progress.value < 1.0) {
             text.push_str(&format!(", mean progress {:.1}%", progress.value * 1e2));
         }
-        if let Some(Seeing { rendering, encoding }) = self.seeing {
-            let (query, policy) = (self.latency.0, (self.latency.0 - encoding).max(0.0));
+        if let (Some(Seeing { rendering, encoding }), Some((query, _))) = (self.seeing, self.latency) {
+            let policy = (query - encoding).max(0.0);
             text.push_str(&format!(
                 "\n  a query: {rendering:.1} ms of rendering before it, {query:.1} ms of its own: {encoding:.1} of encoding, \
                  {policy:.1} of policy (medians)"

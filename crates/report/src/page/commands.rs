@@ -40,6 +40,13 @@ impl Words {
         }
     }
 
+    /// The module of the evaluation's environment, which runs only if it is named.
+    fn module(&mut self, record: &EvaluationRecord) {
+        if let Some(module) = &record.protocol.env_module {
+            self.option("--env-module", module);
+        }
+    }
+
     fn line(&self) -> String {
         self.0.iter().map(|word| shell_quoted(word)).collect::<Vec<_>>().join(" ")
     }
@@ -59,6 +66,7 @@ pub(super) fn rerun(row: &LeaderboardRow, places: &Places) -> String {
     let folder = row.evaluations().next().and_then(|one| one.folder.file_name());
     let name = folder.map_or_else(|| row.record().folder_name(), |name| name.to_string_lossy().into_owned());
     let mut words = Words::new("rerun", &name);
+    words.module(row.record());
     words.places(places);
     words.line()
 }
@@ -122,9 +130,7 @@ fn evaluation(row: &LeaderboardRow, seed: Option<u64>, task: Option<&str>, place
     if let Some(perturbation) = &record.protocol.perturbation {
         words.option("--perturb", perturbation);
     }
-    if let Some(module) = &record.protocol.env_module {
-        words.option("--env-module", module);
-    }
+    words.module(record);
     if forced(record) {
         words.flag("--force");
     }
@@ -193,7 +199,7 @@ mod tests {
              --temporal-ensemble -0.01 --perturb hue=0.5 --env-module my.envs --force --again --zoo 'my zoo' --results \
              'it'\\''s'"
         );
-        assert!(rerun(&odd, &places).ends_with(" --zoo 'my zoo' --results 'it'\\''s'"));
+        assert!(rerun(&odd, &places).ends_with(" --env-module my.envs --zoo 'my zoo' --results 'it'\\''s'"));
     }
 
     #[test]

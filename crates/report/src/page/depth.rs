@@ -39,8 +39,10 @@ pub const DEPTH_COLUMNS: &[Column<Depth>] = &[
     number(|depth: &Depth| Some(depth.row.interval.0), 4, 4).csv("ci95_low"),
     number(|depth: &Depth| Some(depth.row.interval.1), 4, 4).csv("ci95_high"),
     text(|depth: &Depth| format!("{}%", interval_text(depth.row.interval, 1, '–'))).page("95% interval"),
-    number(|depth: &Depth| Some(depth.query_ms().0), 3, 2).csv("inference_ms_median").page("a query, ms\nmedian"),
-    number(|depth: &Depth| Some(depth.query_ms().1), 3, 2).csv("inference_ms_p95").page("95% below"),
+    number(|depth: &Depth| Some(depth.row.inference_ms()?.0), 3, 2)
+        .csv("inference_ms_median")
+        .page("a query, ms\nmedian"),
+    number(|depth: &Depth| Some(depth.row.inference_ms()?.1), 3, 2).csv("inference_ms_p95").page("95% below"),
 ];
 
 impl Depth {
@@ -54,9 +56,9 @@ impl Depth {
         self.row.counts
     }
 
-    /// Median and 95% quantile of a query's duration, in milliseconds.
-    pub fn query_ms(&self) -> (f64, f64) {
-        self.row.inference_ms()
+    /// The median duration of a query, `1.2 ms`.
+    fn query_text(&self, digits: usize) -> String {
+        self.row.inference_ms().map_or_else(|| "-".to_owned(), |(median, _)| format!("{median:.digits$} ms"))
     }
 
     /// Depths are compared where nothing but the thinking differs.
@@ -142,7 +144,7 @@ fn chart(depths: &[&Depth]) -> String {
     for (&steps, depth) in &ticks {
         let free = named.is_none_or(|before| share(steps) - before > 0.13) && share(most) - share(steps) > 0.13;
         if free || steps == most {
-            plot.tick(share(steps), [&steps.to_string(), &format!("{:.1} ms", depth.query_ms().0)]);
+            plot.tick(share(steps), [&steps.to_string(), &depth.query_text(1)]);
             named = Some(share(steps));
         }
     }
@@ -157,7 +159,7 @@ fn chart(depths: &[&Depth]) -> String {
             line.iter().map(|depth| format!("{:.1} {:.1}", x(depth), Plot::y(depth.counts().rate()))).collect();
         plot.line(index, index, &format!("M{}", corners.join("L")), how);
         for depth in *line {
-            let title = format!("{how}, {} steps: {}, {:.2} ms", depth.steps, depth.counts(), depth.query_ms().0);
+            let title = format!("{how}, {} steps: {}, {}", depth.steps, depth.counts(), depth.query_text(2));
             plot.point(index, x(depth), depth.counts().rate(), depth.row.interval, &title);
         }
         let steps: Vec<String> = line.iter().map(|depth| depth.steps.to_string()).collect();

@@ -39,8 +39,13 @@ fn wilson(successes: f64, n: f64) -> (f64, f64) {
 /// A share in percent, with `digits` decimal places and more where those would say that all or none succeeded: 6,597 of
 /// 6,600 is `99.95`, never `100.0`.
 pub fn percent(part: u64, of: u64, digits: usize) -> String {
-    let rate = part as f64 / of.max(1) as f64 * 1e2;
-    let some = 0 < part && part < of;
+    share_percent(part as f64 / of.max(1) as f64, digits)
+}
+
+/// A share between 0 and 1 in percent, like [`percent`].
+pub fn share_percent(share: f64, digits: usize) -> String {
+    let rate = share * 1e2;
+    let some = 0.0 < share && share < 1.0;
     let text = |digits: usize| format!("{rate:.digits$}");
     let edge = |text: &str| text.parse::<f64>().is_ok_and(|shown| shown == 0.0 || shown == 100.0);
     (digits..12).map(text).find(|text| !some || !edge(text)).unwrap_or_else(|| text(12))

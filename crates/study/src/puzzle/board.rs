@@ -11,7 +11,7 @@ use report::{count_text, wilson_interval};
 use super::evaluation::{Judge, PuzzleEvaluation, Starts, TEST_SEED};
 use super::grade::Counts;
 
-/// Best first inside each task; ties by what does not change.
+/// Best first inside each task, by the lower end of the interval; ties by what does not change.
 pub fn rank_puzzles(evaluations: &[PuzzleEvaluation]) -> Vec<PuzzleEvaluation> {
     let mut rows = evaluations.to_vec();
     rows.sort_by(order);
@@ -22,12 +22,11 @@ fn order(one: &PuzzleEvaluation, two: &PuzzleEvaluation) -> Ordering {
     let group = |row: &PuzzleEvaluation| {
         (row.task.clone(), row.givens, row.seed, row.starts.most, row.views, row.judge == Judge::Cells)
     };
-    let share = |row: &PuzzleEvaluation, other: &PuzzleEvaluation| {
-        u128::from(row.answers.valid) * u128::from(other.answers.puzzles.max(1))
-    };
+    // so that 1 of 1 does not come before 599 of 600
+    let least = |row: &PuzzleEvaluation| wilson_interval(row.answers.valid, row.answers.puzzles).0;
     group(one)
         .cmp(&group(two))
-        .then_with(|| share(two, one).cmp(&share(one, two)))
+        .then_with(|| least(two).total_cmp(&least(one)))
         .then_with(|| two.answers.exact.cmp(&one.answers.exact))
         .then_with(|| one.training.parameters.cmp(&two.training.parameters))
         .then_with(|| one.entry.cmp(&two.entry))
@@ -187,7 +186,7 @@ pub fn puzzle_section(evaluations: &[PuzzleEvaluation]) -> String {
         let _ = writeln!(
             html,
             "<h3>{}</h3>\n<p class=\"lead\">Puzzles of the test split, answered in this program. Right: any shortest path, \
-             or the solution. Exact: cell by cell the stored answer. Without thought: the best of the answers that do not \
+             the solution, or the goal reached. Exact: cell by cell the stored answer. Without thought: the best of the answers that do not \
              look at the walls.</p>\n<div class=\"card\">{}</div>",
             escape(&task),
             html::table(PUZZLE_COLUMNS, rows)
@@ -278,6 +277,9 @@ mod tests {
         let html = puzzle_section(&rows);
         assert!(html.contains("<td>190/200</td>") && html.contains("1: 47.5%, 2: 95.0%"), "{html}");
         assert_eq!(puzzle_section(&[]), "");
+        let mut lucky = row("lucky", 1, "open8");
+        (lucky.answers.puzzles, lucky.answers.exact) = (1, 1);
+        assert_eq!(rank_puzzles(&[lucky, row("a", 190, "open8")])[0].entry.name, "a");
         // other puzzles and other rules are ranked by themselves
         let fresh = PuzzleEvaluation { seed: 21_000, ..row("a", 200, "open8") };
         let often = PuzzleEvaluation { starts: Starts { most: 8, noise: 1.0 }, ..row("a", 200, "open8") };

@@ -248,6 +248,18 @@ impl StudyTest {
         format!("{experiment}_seed-{seed}{other}{givens}{fresh}{depth}{starts}{views}{judge}.json")
     }
 
+    /// Whether a result of `experiment` is of this test.
+    fn has(&self, experiment: &str, result: &PuzzleEvaluation) -> bool {
+        // experiments are named after their puzzles
+        let task = self.task.or_else(|| experiment.rsplit('_').next());
+        let of_puzzles = task == Some(result.task.as_str())
+            && self.givens.is_none_or(|givens| givens == result.givens)
+            && (result.seed, result.answers.puzzles) == (self.seed, STUDY_PUZZLES);
+        // what does not recur has no depth
+        let thought = result.depth == self.depth || result.depth == 0;
+        of_puzzles && thought && (result.starts, result.views, result.judge) == (self.starts, self.views, self.judge)
+    }
+
     /// Whether it is of puzzles that are told apart by the effort of a search.
     pub fn is_rated(&self) -> bool {
         self.task == Some(RATED)
@@ -318,7 +330,7 @@ fn experiment(library: &Library, name: &str, seed: u64) -> Result<PuzzleExperime
     })
 }
 
-/// The result of `test` in `results` if this very experiment made it.
+/// The result of `test` in `results` if this very experiment made it in this very test.
 fn stored(
     results: &Path,
     row: &StudyRow,
@@ -331,7 +343,8 @@ fn stored(
         return Ok(None);
     }
     let result = PuzzleEvaluation::read(&path)?;
-    Ok((result.config_sha256 == config).then_some(result))
+    let of_row = (result.experiment.as_str(), result.training.seed) == (row.experiment, seed);
+    Ok((result.config_sha256 == config && of_row && test.has(row.experiment, &result)).then_some(result))
 }
 
 /// All of one row with one seed; false if it was stopped.
@@ -435,6 +448,23 @@ mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
     use std::collections::BTreeSet;
+
+    #[test]
+    fn a_result_answers_its_own_test_alone() {
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/results/puzzles/trm_dfs10_seed-1.json");
+        let result = PuzzleEvaluation::read(&path).unwrap();
+        let row = STUDY.iter().find(|row| row.experiment == "trm_dfs10").unwrap();
+        let answered: Vec<usize> =
+            (0..row.tests.len()).filter(|&at| row.tests[at].has(row.experiment, &result)).collect();
+        assert_eq!(answered, [0]);
+        let deeper = StudyTest { depth: 24, ..PLAIN };
+        assert!(!deeper.has(row.experiment, &result));
+        // under the name of another test's file
+        let folder = tempfile::tempdir().unwrap();
+        result.write(&folder.path().join(row.tests[2].file_name(row.experiment, 1))).unwrap();
+        let found = study_results(&Library::built_in(), folder.path()).unwrap();
+        assert!(found.iter().all(|(.., results)| results.is_empty()));
+    }
 
     #[test]
     fn every_row_is_an_experiment_and_every_test_has_a_file_of_its_own() {

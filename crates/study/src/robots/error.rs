@@ -18,8 +18,8 @@ pub enum StudyError {
         /// Why.
         source: Box<StudyError>,
     },
-    /// A cell was asked for that the study has not.
-    #[error("cell `{cell}`: expected one that `actrm-zoo study STUDY --list` names")]
+    /// A cell was asked for, or a part of names, that the study has not.
+    #[error("cell `{cell}`: expected one that `actrm-zoo study STUDY --list` names, or with --only a part of its name")]
     UnknownCell {
         /// What was asked for.
         cell: String,

@@ -10,6 +10,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 use std::path::Path;
 
+use report::share_percent;
 use report::statistics::{Estimate, difference, holm, over_trainings};
 use zoo::ZooError;
 
@@ -36,7 +37,17 @@ fn read_results(study: &Study) -> Result<Results, ZooError> {
             let found = CellResult::read(&study.results.join(cell.file_name(test)))?;
             if let Some(result) = found.filter(|result| result.answers(study, &cell, test)) {
                 let key = (test.clone(), cell.data.clone(), cell.arm.clone());
-                results.entry(key).or_default().insert(cell.seed, result);
+                let trainings: &mut Trainings = results.entry(key).or_default();
+                let twin = |other: &&CellResult| {
+                    other.seed != result.seed && other.weights.is_some() && other.weights == result.weights
+                };
+                if let Some(other) = trainings.values().find(twin) {
+                    return Err(ZooError::Malformed {
+                        path: study.results.join(cell.file_name(test)),
+                        reason: format!("weights: those of seed {}; each training has its own", other.seed),
+                    });
+                }
+                trainings.insert(cell.seed, result);
             }
         }
     }
@@ -383,7 +394,7 @@ fn cell_text(trainings: &Trainings, groups: &[String]) -> String {
 
 fn percent(estimate: &Estimate) -> String {
     let Estimate { value, low, high } = estimate;
-    format!("{:.1}% [{:.0}-{:.0}]", 100.0 * value, 100.0 * low, 100.0 * high)
+    format!("{}% [{:.0}-{:.0}]", share_percent(*value, 1), 100.0 * low, 100.0 * high)
 }
 
 /// A comparison, the number of trainings on each side, the success of each, and the difference with its adjusted p.

@@ -143,11 +143,14 @@ impl CellResult {
         }
     }
 
-    /// Whether it is of this cell and test, with demonstrations and rules as the study has them now.
+    /// Whether it is of this cell and test, with experiment, demonstrations and rules as the study has them now.
     pub(super) fn answers(&self, study: &Study, cell: &Cell, test: &str) -> bool {
         let of_cell = (&self.arm, &self.data, self.seed) == (&cell.arm, &cell.data, cell.seed);
+        let trained_as =
+            |arm: &Arm| (&arm.experiment, &arm.set) == (&self.arm_definition.experiment, &self.arm_definition.set);
         of_cell
             && self.test == test
+            && study.arms.get(&cell.arm).is_some_and(trained_as)
             && study.data.get(&cell.data) == Some(&self.data_definition)
             && study.tests.get(test) == Some(&self.test_definition)
     }
@@ -191,7 +194,31 @@ impl CellResult {
         if result.format != Self::FORMAT {
             return Err(malformed(format!("format: expected {}, found {}", Self::FORMAT, result.format)));
         }
+        result.check().map_err(malformed)?;
         Ok(Some(result))
+    }
+
+    /// Whether it has every episode of its test and says one thing of each.
+    fn check(&self) -> Result<(), String> {
+        let test = &self.test_definition;
+        let asked = Seeds { start: test.seed_start, count: test.episodes };
+        if self.seeds != asked || !self.episodes.iter().map(|episode| episode.seed).eq(asked.iter()) {
+            let found = self.episodes.len();
+            return Err(format!(
+                "episodes: expected one of each seed of {asked}, in order; found {found} that are not these"
+            ));
+        }
+        if self.training.seed != self.seed {
+            return Err(format!("training.seed: expected {}, found {}", self.seed, self.training.seed));
+        }
+        let wrong = |episode: &&EpisodeOutcome| {
+            let fits = |progress: f64| (0.0..=1.0).contains(&progress) && (!episode.success || progress == 1.0);
+            !episode.progress.is_none_or(fits)
+        };
+        match self.episodes.iter().find(wrong) {
+            Some(episode) => Err(format!("episode {}: its progress does not fit its success", episode.seed)),
+            None => Ok(()),
+        }
     }
 
     /// Writes it.

@@ -95,8 +95,10 @@ pub fn run_robot_study(
     };
     let total: usize = all.iter().map(|cell| cell.tests.len()).sum();
     let training = all.iter().map(|cell| (cell.name(), Mutex::new(()))).collect();
-    if let Some(name) = request.cells.iter().find(|name| all.iter().all(|cell| cell.name() != **name)) {
-        return Err(StudyError::UnknownCell { cell: name.clone() });
+    let nobodys = request.cells.iter().find(|name| all.iter().all(|cell| cell.name() != **name));
+    let nowhere = request.only.iter().find(|part| all.iter().all(|cell| !cell.name().contains(part.as_str())));
+    if let Some(cell) = nobodys.or(nowhere) {
+        return Err(StudyError::UnknownCell { cell: cell.clone() });
     }
     let mut due = VecDeque::new();
     let mut there = 0;
@@ -544,6 +546,7 @@ mod tests {
         let library = Library::built_in();
         let cell = cells(&study).into_iter().next().unwrap();
         let (_, settings) = experiment(&study, &library, &cell).unwrap();
+        let episode = |seed: u64| serde_json::json!({"seed": seed, "success": true, "steps": 60});
         let of = |weights: Option<&str>, parameters: u64| -> CellResult {
             serde_json::from_value(serde_json::json!({
                 "format": 1, "arm": cell.arm, "arm_definition": study.arms[&cell.arm], "data": cell.data,
@@ -557,7 +560,8 @@ mod tests {
                     "rules": 1, "task": "Lift", "env_name": "Lift", "env_module": null, "env_module_sha256": null,
                     "env_args_sha256": null, "control": "compiled", "max_steps": 200,
                 },
-                "seeds": {"start": 40_000, "count": 4}, "versions": {}, "query_ms": 1.0, "episodes": [],
+                "seeds": {"start": 40_000, "count": 4}, "versions": {}, "query_ms": 1.0,
+                "episodes": (40_000..40_004).map(episode).collect::<Vec<_>>(),
             }))
             .unwrap()
         };
@@ -570,6 +574,11 @@ mod tests {
             "{error}"
         );
         assert!(!request.work.exists(), "nothing was begun");
+        for part in ["act-on-lift", "act-on-lift-seed2"] {
+            let only = RobotStudyRequest { only: vec![part.to_owned()], ..self::request(study.clone(), folder.path()) };
+            let error = run_robot_study(&only, &mut |_| {}).unwrap_err();
+            assert_eq!(matches!(error, StudyError::UnknownCell { .. }), part.ends_with('2'), "{error}");
+        }
 
         // an entry of other weights, of the same weights, the entry itself, and what has none
         let meta = |entry: &str| {
