@@ -165,11 +165,17 @@ def found_by_lerobot(entry: Path, task: str, folder: Path) -> str:
     before, after = make_pre_post_processors(config)
     assert np.array_equal(after(policy.select_action(before(dict(seen)))).numpy(), wanted)
     assert np.array_equal(policy.predict_action_chunk(before(dict(seen))).numpy(), planned)
-    policy.save_pretrained(folder / "saved")
+    # an episode may be of chunks alone; the next one has the next seed
+    policy.reset()
+    policy.predict_action_chunk(before(dict(seen)))
+    assert policy.next_seed == config.seed + 2, policy.next_seed
+    for _ in range(2):
+        policy.save_pretrained(folder / "saved")
     loaded = PreTrainedConfig.from_pretrained(folder / "saved")
     loaded.pretrained_path = folder / "saved"
     again = make_policy(loaded, env_cfg=env)
     assert str(again.policy.path).startswith(str(folder)), again.policy.path
+    again.save_pretrained(folder / "saved")
     before, after = make_pre_post_processors(loaded, pretrained_path=str(folder / "saved"))
     assert np.array_equal(after(again.select_action(before(dict(seen)))).numpy(), wanted)
     return f"{ours.id}, from its type and from what was saved"

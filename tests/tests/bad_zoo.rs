@@ -119,10 +119,10 @@ fn an_entry_with_one_flipped_byte() {
 fn a_page_of_a_study_without_results() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let (study, page) = (folder.path().join("study.toml"), folder.path().join("page.md"));
-    let shipped = fs::read_to_string(e2e::root().join("studies/fewer_demonstrations.toml")).expect("a study");
+    let shipped = fs::read_to_string(e2e::root().join("studies/pillar.toml")).expect("a study");
     let results = folder.path().join("results");
-    let shipped = shipped.replace("\"docs/results/fewer_demonstrations.md\"", &format!("{page:?}"));
-    let shipped = shipped.replace("\"docs/results/fewer_demonstrations\"", &format!("{results:?}"));
+    let shipped = shipped.replace("\"docs/results/pillar.md\"", &format!("{page:?}"));
+    let shipped = shipped.replace("\"docs/results/pillar\"", &format!("{results:?}"));
     fs::write(&study, shipped).expect("writable");
     refused(&mut zoo(["study", text(&study), "--page-only"]), &["study.toml", text(&results), "without --page-only"]);
     assert!(!page.exists());

@@ -72,6 +72,17 @@ fn parts_are_joined_to_the_whole_and_others_are_refused() {
     refused(&mut zoo(["merge", text(&parts[0]), text(&foreign), "--zoo", text(&entries)]), &["execution: expected"]);
     refused(&mut zoo(["merge", text(&parts[0]), text(&parts[0]), "--zoo", text(&entries)]), &["once"]);
 
+    // an evaluation that lacks a part keeps no other from being joined
+    let both = entries.join("both");
+    for (episodes, part) in [("2", "1/2"), ("4", "1/2"), ("4", "2/2")] {
+        succeeds(&mut eval(&entries, episodes, &["--shard", part, "--results", text(&both)]));
+    }
+    let output = zoo(["merge", "--zoo", text(&entries), "--results", text(&both)]).output().expect("it runs");
+    let (out, error) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
+    assert_eq!(output.status.code(), Some(1), "{error}");
+    assert!(out.contains("of 4 episodes succeeded"), "{out}");
+    assert!(error.contains("10000-10001") && error.contains("no 2/2"), "{error}");
+
     assert!(said(&mut zoo(["merge", "--zoo", text(&entries)])).contains("of 4 episodes succeeded"));
     let whole = entries.join("whole");
     succeeds(&mut eval(&entries, "4", &["--results", text(&whole)]));
@@ -161,14 +172,21 @@ fn another_way_to_act_is_another_evaluation() {
         &["--n-action-steps", "1 to the action horizon, 16", "17"],
     );
     refused(&mut eval(&entries, "1", &["--temporal-ensemble", "nan"]), &["--temporal-ensemble", "finite", "NaN"]);
+    let mut robots = zoo(["eval", "lift-act@1", "--protocol", "lift-v1", "--robots", "UR5e", "--zoo", text(&entries)]);
+    refused(&mut robots, &["--protocol", "--robots", "cannot be used with"]);
 }
 
 /// Say of a file that robosuite 1.4.1 recorded it.
 fn of_another_generation(file: &Path) {
+    of_other_arguments(file, |env_args| env_args.replace("\"1.5.2\"", "\"1.4.1\""));
+}
+
+/// Change what a file says of the environment that it was recorded in.
+fn of_other_arguments(file: &Path, change: impl Fn(&str) -> String) {
     let file = hdf5::File::open_rw(file).expect("the copy opens");
     let attribute = file.group("data").and_then(|group| group.attr("env_args")).expect("env_args");
     let stored: hdf5::types::VarLenUnicode = attribute.read_scalar().expect("text");
-    let changed = stored.as_str().replace("\"1.5.2\"", "\"1.4.1\"");
+    let changed = change(stored.as_str());
     assert_ne!(changed, stored.as_str());
     let changed: hdf5::types::VarLenUnicode = changed.parse().expect("text");
     attribute.write_scalar(&changed).expect("writable");
@@ -185,6 +203,27 @@ fn demonstrations_of_another_simulator_generation_are_refused_unless_forced() {
     refused(&mut eval(&entries, "1", &[]), &["lift-act@1", "1.4.1", "1.5.2", "--force"]);
     assert!(!entries.join("results").exists());
     succeeds(&mut eval(&entries, "1", &["--force"]));
+}
+
+#[test]
+fn a_module_that_a_file_names_runs_only_if_the_user_names_it() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let (file, entries) = (folder.path().join("theirs.hdf5"), folder.path().join("zoo"));
+    fs::copy(lift(), &file).expect("the shipped demonstrations");
+    let module = format!("{{\"env_module\": {{\"name\": \"theirs\", \"sha256\": \"{}\"}}, ", "0".repeat(64));
+    of_other_arguments(&file, |env_args| env_args.replacen('{', &module, 1));
+    // Python finds it in the folder that the commands are run in
+    fs::write(folder.path().join("theirs.py"), "import pathlib\npathlib.Path('ran').touch()\n").expect("writable");
+    let ran = folder.path().join("ran");
+    let film = folder.path().join("film.mp4");
+    let mut replay = data(["replay", text(&file), "--demo", "0", "--video", text(&film)]);
+    refused(replay.current_dir(folder.path()), &["task Lift", "\"theirs\"", "--env-module"]);
+    train_lift(&file, &entries, &folder.path().join("runs"));
+    let mut asked = eval(&entries, "1", &[]);
+    refused(asked.current_dir(folder.path()), &["entry lift-act@1", "\"theirs\"", "--env-module"]);
+    assert!(!ran.exists());
+    succeeds(eval(&entries, "1", &["--env-module", "theirs"]).current_dir(folder.path()));
+    assert!(ran.exists());
 }
 
 /// What a page says between `before` and `after`, again and again.
@@ -265,6 +304,10 @@ fn episodes_and_demonstrations_become_videos() {
     let films = listing(&videos);
     assert!(films.len() == 1 && films[0].starts_with("Lift-10000-failure-"), "{printed}: {films:?}");
     assert!(printed.contains(&films[0]) && is_video(&videos.join(&films[0])), "{printed}");
+    // of a part of the episodes, its own first
+    let part = said(&mut eval(&entries, "2", &["--shard", "2/2", "--video", "1", "--video-size", "64"]));
+    assert!(part.contains("Lift-10001-") && !part.contains("Lift-10000-"), "{part}");
+    refused(&mut eval(&entries, "1", &["--video", "1", "--video-size", "65"]), &["--video-size", "an even number"]);
 
     // of a robomimic file, and of the data set that was converted from it: the same images
     let set = trained().join("lift");

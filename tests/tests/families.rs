@@ -88,6 +88,7 @@ fn entries_are_compared_seed_by_seed() {
     let value = json(&mut compare(&["--until-decided", "--most", "24", "--max-steps", "4", "--json"]));
     assert_eq!((&value["seeds"], &value["flips"]["decided_after"]), (&24.into(), &Value::Null), "{value}");
     refused(&mut zoo(["compare", "lift-act@1", "lift-act@1", "--until-decided", "--zoo", text(&entries)]), &["twice"]);
+    refused(&mut compare(&["--max-steps", "4"]), &["--max-steps: expected --until-decided"]);
     refused(&mut zoo(["compare", "lift-act", "door", "--zoo", text(&entries)]), &["unknown entry `door`"]);
 }
 
@@ -225,6 +226,7 @@ fn entries_differ_in_what_they_say() {
     assert!(curves.contains("lift-act@1") && curves.contains('█'), "{curves}");
     let picture = entries.join("curves.svg");
     succeeds(&mut command(&["curves", "*-act", "--svg", text(&picture)]));
+    refused(&mut command(&["curves", "*-act", "--svg", text(&picture)]), &["curves.svg: exists already"]);
     let svg = fs::read_to_string(&picture).expect("a picture");
     assert!(svg.starts_with("<svg xmlns=") && svg.matches("<polyline").count() == 6, "{}", &svg[..200]);
 }

@@ -45,6 +45,8 @@ fn train(folder: &Path) -> Command {
         "train.steps=60",
         "train.checkpoint_every=7",
         "train.batch_size=8",
+        "train.accumulation=2",
+        "train.ema_decay=0.9",
         "policy.dim_model=32",
     ]);
     command.args(["--seeds", "1..2", "--data", text(&trained().join("lift"))]);

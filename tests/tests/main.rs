@@ -27,7 +27,6 @@ mod sizes;
 mod stopping;
 mod terminal;
 mod tracing;
-mod training_stops;
 mod trust;
 mod vision;
 

@@ -287,7 +287,8 @@ fn the_page_of_a_data_set_says_what_is_in_it() {
     viewed(folder.path());
     // a page of the command is replaced, another file is not
     let first = fs::read(at("films.html")).expect("a page");
-    succeeds(&mut data(["view", text(&films), "--out", text(&at("films.html"))]));
+    let replaced = succeeds(&mut data(["view", text(&films), "--out", text(&at("films.html"))]));
+    assert!(String::from_utf8_lossy(&replaced.stdout).contains("replaced"), "{replaced:?}");
     assert_ne!(fs::read(at("films.html")).expect("a page"), first);
     fs::write(at("own.html"), "<!doctype html>\n<p>mine</p>\n").expect("writable");
     let words = ["own.html: exists already and is no page of this command"];

@@ -46,7 +46,7 @@ fn every_command_works_in_a_folder_whose_name_is_not_utf8() {
         &["stats", "@/set", "--json"],
         &["query", "@/set", "SELECT demo FROM episodes", "--json"],
         &["plot", "@/set", "--out", "@/set.svg"],
-        &["puzzle", "open8", "@/open8.parquet", "--count", "5", "--json"],
+        &["puzzle", "open8", "@/puzzles/open8.parquet", "--count", "5", "--json"],
     ] {
         works(folder, data, arguments);
     }

@@ -27,7 +27,7 @@ fn executed(trace: &Value) -> Vec<Value> {
 #[test]
 fn a_shipped_entry_s_episode_is_shown_query_by_query() {
     let folder = tempfile::tempdir().expect("a temporary folder");
-    let table = folder.path().join("trace.parquet");
+    let table = folder.path().join("new/trace.parquet");
     let entries = root().join("zoo");
     let trace = |more: &[&str]| {
         let mut command = zoo(["trace", "lift-act@1", "--seed", "10000", "--zoo", text(&entries)]);
@@ -37,6 +37,9 @@ fn a_shipped_entry_s_episode_is_shown_query_by_query() {
     let shown = said(&mut trace(&["--parquet", text(&table)]));
     assert!(shown.starts_with("lift-act@1 on Lift, seed 10000: success after "), "{shown}");
     assert!(table.is_file());
+    for option in ["--parquet", "--svg"] {
+        refused(&mut trace(&[option, text(&table)]), &["trace.parquet: exists already"]);
+    }
     let json = || serde_json::from_str::<Value>(&said(&mut trace(&["--json"]))).expect("JSON");
     let (one, two) = (json(), json());
     assert_eq!(one["success"], true);
@@ -136,4 +139,5 @@ fn attention_is_drawn_and_other_depths_are_counted() {
     let mut probe = zoo(["probe", "lift-actrm", "--episodes", "2", "--workers", "1", "--zoo", text(&entries)]);
     probe.args(["--data", text(&folder.path().join("lift")), "--work", text(&folder.path().join("probe"))]);
     refused(&mut probe, &["NAME_points", "lift-actrm"]);
+    refused(probe.args(["--out", text(&table)]), &["trace.parquet: exists already"]);
 }

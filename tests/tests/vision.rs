@@ -124,10 +124,21 @@ fn what_a_policy_looks_at_is_drawn() {
         assert!(cameras.iter().all(|camera| camera["most"].as_f64().is_some_and(|x| x > 0.0)), "{query}");
     }
     assert!(fs::read(&out).expect("a picture").starts_with(b"\x89PNG"));
+    refused(&mut saliency("lift-act-image@1", &entries), &["looked.png: exists already"]);
     refused(&mut saliency("lift-act@1", &e2e::root().join("zoo")), &["lift-act@1", "not an image policy"]);
     // a thought about pictures is traced in the environment of its demonstrations
     let traced = said(&mut zoo(["trace", "lift-act-image@1", "--zoo", text(&entries)]));
     assert!(traced.starts_with("lift-act-image@1 on Lift, seed 10000: "), "{traced}");
+}
+
+#[test]
+fn an_image_policy_thinks_in_the_environment_of_its_demonstrations() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let mut depth =
+        zoo(["depth", "lift-actrm-image-s1", "--steps", "1", "--episodes", "1", "--workers", "1", "--json"]);
+    depth.args(["--zoo", text(&e2e::root().join("zoo")), "--work", text(folder.path())]);
+    let rows: Value = serde_json::from_str(&said(&mut depth)).expect("JSON");
+    assert_eq!((&rows[0]["steps"], &rows[0]["episodes"]), (&Value::from(1), &Value::from(1)), "{rows}");
 }
 
 #[test]

@@ -4,9 +4,11 @@
 //! mean colour moves over it; how far the predicted actions move away from those of the whole picture, in the network's
 //! units, is what the place under it meant to the policy. It needs nothing of the model but predictions.
 
+use std::sync::Arc;
+
 use candle_core::{Device, Tensor};
 use dataset::Picture;
-use models::{ActionChunk, FeatureKind, FeatureSpec, Features, ModelError, Observation, Policy, ThoughtStep};
+use models::{FeatureKind, FeatureSpec, Features, ModelError, Observation};
 use rollout::{Outcome, Pool};
 use serde::Serialize;
 use zoo::ZooError;
@@ -14,7 +16,7 @@ use zoo::entry::LoadedEntry;
 use zoo::evaluation::{Subject, image};
 use zoo::experiment::IMAGE_PREFIX;
 
-use crate::episode::{Log, record};
+use crate::episode::{Answered, Note, Noted, record};
 
 /// Covered squares that are predicted at once.
 const ROWS: usize = 32;
@@ -66,57 +68,6 @@ pub struct SalientCamera {
     pub heat: Vec<f32>,
 }
 
-/// A policy whose queries' observations are kept.
-struct Watched {
-    policy: Box<dyn Policy>,
-    /// control steps before each query, and the observations of it
-    queries: Log<(usize, Vec<Observation>)>,
-    history: Vec<Observation>,
-    step: usize,
-}
-
-impl Watched {
-    fn show(&mut self, observation: &Observation) {
-        let most = self.policy.n_obs_steps();
-        self.history.push(observation.clone());
-        let over = self.history.len().saturating_sub(most);
-        self.history.drain(..over);
-    }
-}
-
-impl Policy for Watched {
-    fn predict(&mut self, observation: &Observation) -> Result<ActionChunk, ModelError> {
-        self.show(observation);
-        self.queries.push((self.step, self.history.clone()));
-        self.policy.predict(observation)
-    }
-
-    fn n_obs_steps(&self) -> usize {
-        self.policy.n_obs_steps()
-    }
-
-    fn observe(&mut self, observation: &Observation) {
-        self.show(observation);
-        self.policy.observe(observation);
-    }
-
-    fn executed(&mut self, actions: usize) {
-        self.step += actions;
-        self.policy.executed(actions);
-    }
-
-    fn reset(&mut self, seed: u64) {
-        self.step = 0;
-        self.history.clear();
-        self.queries.take();
-        self.policy.reset(seed);
-    }
-
-    fn thought(&self) -> Result<Vec<ThoughtStep>, ModelError> {
-        self.policy.thought()
-    }
-}
-
 /// Runs the episode of `seed` as an evaluation would and looks at up to `queries` of its queries, evenly spread; nothing
 /// if it was stopped. `progress` is told how many are done of how many.
 ///
@@ -131,15 +82,15 @@ pub fn saliency(
     progress: &mut dyn FnMut(u64, u64),
 ) -> Result<Option<Saliency>, ZooError> {
     let task = pool.ready().task.clone();
-    let watched = |policy, queries| Watched { policy, queries, history: Vec::new(), step: 0 };
-    let Some((outcome, observed)) = record(subject, pool, seed, &watched)? else { return Ok(None) };
+    let note: Note<Vec<Observation>> = Arc::new(|answered: &Answered<'_>| Ok(answered.seen.to_vec()));
+    let Some((outcome, observed)) = record(subject, pool, seed, &note)? else { return Ok(None) };
     let chosen = evenly(observed.len(), queries);
     let failed =
         |source| ZooError::Model { operation: "look at the images of", name: subject.entry.to_string(), source };
     let mut looked = Vec::with_capacity(chosen.len());
     for (done, &at) in chosen.iter().enumerate() {
         progress(done as u64, chosen.len() as u64);
-        let (step, history) = &observed[at];
+        let Noted { step, what: history, .. } = &observed[at];
         let seen = loaded.preprocess().observation(history).map_err(failed)?;
         let last = history.last().expect("a query has an observation");
         let cameras = subject.signature.of_kind(FeatureKind::Image);

@@ -3,12 +3,11 @@
 use std::fmt::Write as _;
 use std::path::Path;
 use std::sync::Arc;
-use std::time::Instant;
 
 use arrow_array::builder::{Float64Builder, ListBuilder};
 use arrow_array::{ArrayRef, BooleanArray, Float64Array, UInt32Array, UInt64Array};
 use models::actrm::{Actrm, Config, Over};
-use models::{ActionChunk, ModelError, Observation, Policy, Preprocess, ThoughtStep, Values};
+use models::{ActionChunk, ModelError, Observation, Preprocess, ThoughtStep, Values};
 use rollout::{Pool, RolloutError};
 use serde::Serialize;
 use zoo::ZooError;
@@ -16,7 +15,7 @@ use zoo::entry::LoadedEntry;
 use zoo::evaluation::Subject;
 use zoo::results::write_table;
 
-use crate::episode::{Log, record};
+use crate::episode::{Answered, Note, Noted, record};
 
 /// One episode of a policy.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -141,78 +140,29 @@ pub struct TracedThought {
     pub way: Vec<f32>,
 }
 
-/// A policy whose queries are kept.
-struct Traced {
-    policy: Box<dyn Policy>,
-    queries: Log<TracedQuery>,
-    step: usize,
-    examiner: Option<Examiner>,
-    /// the observations that the policy sees at once, oldest first
-    seen: Vec<Observation>,
-}
-
-impl Traced {
-    fn see(&mut self, observation: &Observation) {
-        self.seen.push(observation.clone());
-        let surplus = self.seen.len().saturating_sub(self.policy.n_obs_steps());
-        self.seen.drain(..surplus);
-    }
-}
-
 fn rows(chunk: &ActionChunk) -> Vec<Vec<f32>> {
     chunk.rows().map(<[f32]>::to_vec).collect()
 }
 
-impl Policy for Traced {
-    fn predict(&mut self, observation: &Observation) -> Result<ActionChunk, ModelError> {
-        let asked = Instant::now();
-        let chunk = self.policy.predict(observation)?;
-        let milliseconds = asked.elapsed().as_secs_f64() * 1e3;
-        let of = |step: ThoughtStep| {
-            let ThoughtStep { chunk, change, halt, milliseconds } = step;
-            let (attention, way) = (Vec::new(), Vec::new());
-            TracedThought { actions: rows(&chunk), change, halt: Some(halt), milliseconds, attention, way }
-        };
-        let mut thought: Vec<TracedThought> = self.policy.thought()?.into_iter().map(of).collect();
-        if thought.is_empty() {
-            let (actions, attention, way) = (rows(&chunk), Vec::new(), Vec::new());
-            thought.push(TracedThought { actions, change: None, halt: None, milliseconds, attention, way });
-        }
-        self.see(observation);
-        if let Some(examiner) = &self.examiner {
-            examiner.look(&self.seen, &mut thought)?;
-        }
-        let cells = self.examiner.as_ref().map(|examiner| examiner.cells(observation)).unwrap_or_default();
-        let query = TracedQuery { step: self.step, executed: 0, milliseconds, cells, thought };
-        self.queries.push(query);
-        Ok(chunk)
+/// A query and what was thought about it; its place in the episode is known later.
+fn traced(answered: &Answered<'_>, examiner: Option<&Examiner>) -> Result<TracedQuery, ModelError> {
+    let milliseconds = answered.milliseconds;
+    let of = |step: ThoughtStep| {
+        let ThoughtStep { chunk, change, halt, milliseconds } = step;
+        let (attention, way) = (Vec::new(), Vec::new());
+        TracedThought { actions: rows(&chunk), change, halt: Some(halt), milliseconds, attention, way }
+    };
+    let mut thought: Vec<TracedThought> = answered.policy.thought()?.into_iter().map(of).collect();
+    if thought.is_empty() {
+        let (actions, attention, way) = (rows(answered.chunk), Vec::new(), Vec::new());
+        thought.push(TracedThought { actions, change: None, halt: None, milliseconds, attention, way });
     }
-
-    fn n_obs_steps(&self) -> usize {
-        self.policy.n_obs_steps()
+    let mut cells = Vec::new();
+    if let (Some(examiner), Some(now)) = (examiner, answered.seen.last()) {
+        examiner.look(answered.seen, &mut thought)?;
+        cells = examiner.cells(now);
     }
-
-    fn observe(&mut self, observation: &Observation) {
-        self.see(observation);
-        self.policy.observe(observation);
-    }
-
-    fn executed(&mut self, actions: usize) {
-        self.step += actions;
-        self.queries.with_last(|query| query.executed += actions);
-        self.policy.executed(actions);
-    }
-
-    fn reset(&mut self, seed: u64) {
-        self.step = 0;
-        self.seen.clear();
-        self.queries.take();
-        self.policy.reset(seed);
-    }
-
-    fn thought(&self) -> Result<Vec<ThoughtStep>, ModelError> {
-        self.policy.thought()
-    }
+    Ok(TracedQuery { step: 0, executed: 0, milliseconds, cells, thought })
 }
 
 /// Runs the episode of `seed` as an evaluation would and keeps what the policy thought, with what its action tokens
@@ -227,12 +177,14 @@ pub fn trace(
     examiner: Option<&Examiner>,
 ) -> Result<Option<PolicyTrace>, RolloutError> {
     let task = pool.ready().task.clone();
-    let traced = |policy, queries| Traced { policy, queries, step: 0, examiner: examiner.cloned(), seen: Vec::new() };
-    let Some((outcome, mut queries)) = record(subject, pool, seed, &traced)? else { return Ok(None) };
-    for query in &mut queries {
+    let own = examiner.cloned();
+    let note: Note<TracedQuery> = Arc::new(move |answered: &Answered<'_>| traced(answered, own.as_ref()));
+    let Some((outcome, noted)) = record(subject, pool, seed, &note)? else { return Ok(None) };
+    let query = |Noted { step, executed, what }: Noted<TracedQuery>| {
         // the last of what was planned ahead is not executed where the episode ends before
-        query.executed = query.executed.min(outcome.steps.saturating_sub(query.step));
-    }
+        TracedQuery { step, executed: executed.min(outcome.steps.saturating_sub(step)), ..what }
+    };
+    let queries = noted.into_iter().map(query).collect();
     Ok(Some(PolicyTrace {
         entry: subject.entry.to_string(),
         task,

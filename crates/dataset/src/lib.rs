@@ -18,7 +18,7 @@ mod keys;
 mod lerobot;
 mod plan;
 mod puzzle_table;
-pub mod rotation;
+mod rotation;
 mod samples;
 mod sheet;
 pub mod shuffle;

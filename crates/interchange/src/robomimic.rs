@@ -135,10 +135,5 @@ fn environment(metadata: &Value) -> Result<RecordedIn, String> {
     }
     let text = |key: &str| metadata[key].as_str().map(str::to_owned);
     let name = text("env_name").ok_or("env_metadata.env_name: expected text, found none")?;
-    let mut args = metadata.clone();
-    // a module to import is named by who evaluates (`--env-module`), not by a file of somebody else's
-    if let Some(args) = args.as_object_mut() {
-        args.remove("env_module");
-    }
-    Ok(RecordedIn { name, version: text("env_version"), args })
+    Ok(RecordedIn { name, version: text("env_version"), args: crate::without_module(metadata.clone()) })
 }

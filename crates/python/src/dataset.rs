@@ -51,6 +51,8 @@ pub(crate) struct PyDataset {
     tasks: Tasks,
     /// Of each frame of the whole set, by column.
     texts: BTreeMap<String, dataset::Texts>,
+    /// Seconds of each frame of the whole set, where its files have them.
+    times: Option<Vec<f32>>,
     notes: Vec<String>,
 }
 
@@ -110,13 +112,15 @@ impl PyDataset {
         let spec = SampleSpec { offsets, cameras, depth, depth_unit, episodes: chosen.clone() };
         let samples = unlocked(py, || run(|| dataset.samples(&spec)).map_err(raised))?;
         let texts = unlocked(py, || run(|| dataset.texts()).map_err(raised))?;
+        let times = unlocked(py, || run(|| dataset.frame_times()).map_err(raised))?;
+        let times = times.map(|(times, _)| times.into_iter().map(|seconds| seconds as f32).collect());
         let (tasks, notes) = unlocked(py, || {
             let (tasks, untold) = tasks_of(&dataset);
             Ok((tasks, dataset.notes().iter().cloned().chain(untold).chain(notes(&dataset, &samples)).collect()))
         })?;
         let SampleSpec { offsets, cameras, depth, .. } = spec;
         let given = Given { path, offsets, cameras, depth, depth_unit, return_uint8 };
-        Ok(Self { given, dataset, chosen, samples, tasks, texts, notes })
+        Ok(Self { given, dataset, chosen, samples, tasks, texts, times, notes })
     }
 
     fn __len__(&self) -> usize {
@@ -430,13 +434,16 @@ impl PyDataset {
         })
     }
 
-    /// The index columns, which follow from where samples lie.
+    /// The times of the frames, and the index columns, which follow from where samples lie.
     fn places(&self, samples: &[u32], batch: Option<usize>, out: &mut impl Columns) -> PyResult<()> {
         let places: Vec<_> = samples.iter().map(|&sample| self.samples.place(sample)).collect();
         let shape: Vec<usize> = batch.into_iter().collect();
         let fps = self.dataset.info().fps;
         out.add("timestamp", &shape, Kind::Numbers, |out: &mut [f32]| {
-            out.iter_mut().zip(&places).for_each(|(out, place)| *out = (place.frame as f64 / fps) as f32);
+            out.iter_mut().zip(&places).for_each(|(out, place)| {
+                *out =
+                    self.times.as_ref().map_or_else(|| (place.frame as f64 / fps) as f32, |times| times[place.index]);
+            });
         })?;
         let mut set = |name: &str, of: &dyn Fn(&dataset::SamplePlace) -> usize| {
             out.add(name, &shape, Kind::Numbers, |out: &mut [i64]| {

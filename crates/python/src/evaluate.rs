@@ -13,10 +13,10 @@ use pyo3::types::PyDict;
 use rollout::{Control, Pool, PoolOptions, Ready, find_python, harness_folder, remembered_greeting};
 use zoo::entry::LoadedEntry;
 use zoo::evaluation::{
-    Environment, EvaluationEnd, EvaluationOptions, Progress, Subject, evaluate as run_missing, finished,
+    Environment, EvaluationEnd, EvaluationOptions, FIRST_SEED, Progress, Subject, evaluate as run_missing, finished,
 };
 use zoo::external::{External, Named, reads_images, usual_inputs};
-use zoo::protocols::{Block, Protocols};
+use zoo::protocols::{Block, NamedProtocol, Protocols};
 use zoo::results::{Execution, Seeds, StoredEvaluation};
 use zoo::{FeatureKeys, ZooError};
 
@@ -100,25 +100,28 @@ pub(crate) fn evaluate<'py>(
     protocol: Option<String>,
     episodes: Option<i128>,
     workers: i128,
-    seed: i128,
+    seed: Option<i128>,
     task: Option<String>,
     max_steps: Option<i128>,
     n_action_steps: Option<i128>,
     temporal_ensemble: Option<f64>,
-    control: &str,
+    control: Option<&str>,
     python: Option<PathBuf>,
     env_module: Option<String>,
     zoo: Option<PathBuf>,
     results: Option<PathBuf>,
     force: bool,
 ) -> PyResult<Bound<'py, PyDict>> {
-    let mut control: Control = control.parse().map_err(PyValueError::new_err)?;
+    let asked_control: Option<Control> =
+        control.map(str::parse::<Control>).transpose().map_err(PyValueError::new_err)?;
+    let mut control = asked_control.unwrap_or(Control::Compiled);
     let invalid = |text: String| Err(PyValueError::new_err(text));
     let max_steps: Option<usize> = max_steps.map(|steps| natural("max_steps", steps)).transpose()?;
     let n_action_steps: Option<usize> = n_action_steps.map(|steps| natural("n_action_steps", steps)).transpose()?;
     let workers: usize = natural("workers", workers)?;
     let (mut task, mut max_steps) = (task, max_steps);
-    let mut seeds = Seeds { start: natural("seed", seed)?, count: natural("episodes", episodes.unwrap_or(20))? };
+    let start = seed.map_or(Ok(FIRST_SEED), |seed| natural("seed", seed))?;
+    let mut seeds = Seeds { start, count: natural("episodes", episodes.unwrap_or(20))? };
     let mut execution = match (n_action_steps, temporal_ensemble) {
         (Some(_), Some(_)) => {
             return invalid("n_action_steps and temporal_ensemble: expected one of them".to_owned());
@@ -139,17 +142,21 @@ pub(crate) fn evaluate<'py>(
             _ => {}
         }
     }
-    if let Some(name) = &protocol {
-        let protocols = Protocols::built_in();
-        let rules = protocols.get(name).map_err(raised)?;
+    let rules: Option<NamedProtocol> = match &protocol {
+        Some(name) => Some(Protocols::built_in().get(name).map_err(raised)?.clone()),
+        None => None,
+    };
+    if let Some(rules) = &rules {
         let given = [
             ("task", task.as_ref().is_some_and(|task| *task != rules.task)),
             ("episodes", episodes.is_some()),
+            ("seed", seed.is_some()),
+            ("control", asked_control.is_some()),
             ("max_steps", max_steps.is_some()),
             ("n_action_steps or temporal_ensemble", execution.is_some() && rules.execution.is_some()),
         ];
         if let Some((word, _)) = given.iter().find(|(_, given)| *given) {
-            return invalid(format!("{word}: expected as protocol {name} says, found another"));
+            return invalid(format!("{word}: expected as protocol {} says, found another", rules.name));
         }
         (task, max_steps, control) = (Some(rules.task.clone()), Some(rules.max_steps), rules.control);
         (seeds, execution) = (rules.seeds(Block::Test), execution.or(rules.execution));
@@ -216,10 +223,15 @@ pub(crate) fn evaluate<'py>(
             let options = EvaluationOptions { seeds, shard: None, env_module: environment.env_module.clone(), force };
             let note = |text: String| drop(news.send(News::Note(text)));
             let taken_over = |text: String| drop(news.send(News::TakenOver(text)));
+            let doubt = |stored: &StoredEvaluation| {
+                let text = rules.as_ref().and_then(|rules| rules.doubt(&stored.record));
+                text.into_iter().for_each(|text| drop(news.send(News::Late(text))));
+            };
             if let Some(ready) = remembered_greeting(&spec) {
                 let subject = subject_of(&ready)?;
                 if let Some(stored) = finished(&subject, &ready, &results, &options)? {
                     asked.taken_over(&subject, stored.episodes.len() as u64).into_iter().for_each(taken_over);
+                    doubt(&stored);
                     return Ok(End::Complete(Box::new(stored)));
                 }
             }
@@ -249,7 +261,10 @@ pub(crate) fn evaluate<'py>(
             }
             pool.close();
             Ok(match end? {
-                EvaluationEnd::Complete(evaluation) => End::Complete(evaluation),
+                EvaluationEnd::Complete(evaluation) => {
+                    doubt(&evaluation);
+                    End::Complete(evaluation)
+                }
                 EvaluationEnd::Stopped { .. } => End::Stopped,
                 EvaluationEnd::Failed { done, errors } => {
                     let first = errors.first().map_or_else(String::new, |error| words(error));

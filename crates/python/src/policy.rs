@@ -457,8 +457,12 @@ fn feature(spec: &FeatureSpec, value: &Bound<'_, PyAny>) -> PyResult<(Vec<usize>
     let kind: String = picture.getattr("dtype")?.getattr("name")?.extract()?;
     if kind.starts_with("float") {
         // 0 to 1, as PyTorch has them: back to the bytes that they were made of
-        let (least, most) = (picture.call_method0("min")?, picture.call_method0("max")?);
-        let (least, most): (f64, f64) = (least.extract()?, most.extract()?);
+        let size: usize = picture.getattr("size")?.extract()?;
+        let (least, most): (f64, f64) = match size {
+            // its shape is what is wrong
+            0 => (0.0, 0.0),
+            _ => (picture.call_method0("min")?.extract()?, picture.call_method0("max")?.extract()?),
+        };
         // rounding may have left a little above 1; what is no number is in no range
         if !(-BEYOND..=1.0 + BEYOND).contains(&least) || !(-BEYOND..=1.0 + BEYOND).contains(&most) {
             let found = format!("values from {least} to {most}");
@@ -535,7 +539,10 @@ pub(crate) fn registry(zoo: Option<PathBuf>) -> Registry {
 
 /// The folder of a LeRobot checkpoint at `path`, or in the folder that LeRobot's training puts it in.
 fn lerobot_checkpoint(path: &Path) -> Option<PathBuf> {
-    let is_one = |folder: &PathBuf| folder.join("config.json").is_file() && folder.join("model.safetensors").is_file();
+    // in one file, or in several and a list of them
+    let weights = ["model.safetensors", "model.safetensors.index.json"];
+    let has = |folder: &PathBuf, name: &str| folder.join(name).is_file();
+    let is_one = |folder: &PathBuf| has(folder, "config.json") && weights.iter().any(|weights| has(folder, weights));
     [path.to_owned(), path.join("pretrained_model")].into_iter().find(is_one)
 }
 

@@ -80,6 +80,14 @@ def test_frames_without_a_text_large_numbers_and_tasks_within_an_episode(tmp_pat
     assert "task" not in ds[0] and "samples have no task: " in " ".join(ds.notes)
 
 
+def test_timestamps_are_those_of_the_files(tmp_path: Path) -> None:
+    shutil.copytree(FIXTURES / "lerobot_texts", tmp_path / "set")
+    path = tmp_path / "set/meta/info.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "fps": 10}))
+    ds = actrm.Dataset(tmp_path / "set")
+    assert ds.fps == 10 and ds.batch(range(5))["timestamp"].tolist() == np.float32([0, 0.05, 0.1, 0, 0.05]).tolist()
+
+
 def test_rows_follow_each_other_and_end_with_the_episode(lift: Path) -> None:
     ds = actrm.Dataset(lift, delta_timestamps={"action": range(4)})
     plain = actrm.Dataset(lift)

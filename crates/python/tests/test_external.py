@@ -248,6 +248,17 @@ def test_one_simulator_takes_the_object_itself(tmp_path: Path) -> None:
     assert policy.begun == 2
 
 
+def test_a_process_on_one_core_has_one_simulator(tmp_path: Path) -> None:
+    cores = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(cores)})
+    try:
+        # several would need copies of the policy
+        with pytest.raises(actrm.Error, match="`task`: expected a task"):
+            actrm.evaluate(Uncopied(), name="mine", zoo=tmp_path)
+    finally:
+        os.sched_setaffinity(0, cores)
+
+
 def test_what_cannot_be_asked_is_refused_by_name(zoo: Path, tmp_path: Path) -> None:
     for policy, options, words in (
         (Chunks(), {"task": "Lift"}, "n_action_steps: expected how many"),
@@ -262,6 +273,12 @@ def test_what_cannot_be_asked_is_refused_by_name(zoo: Path, tmp_path: Path) -> N
         (Chunks(), {"task": "Lift", "temporal_ensemble": float("nan")}, "temporal_ensemble`: expected a finite number"),
         (Chunks(), {"task": "Lift", "temporal_ensemble": 0.0, "workers": 0}, "workers: expected 1 to 1024, found 0"),
         (Chunks().predict_action_chunk, {"task": "Stack", "protocol": "lift-v1"}, "task: expected as protocol lift-v1"),
+        (Chunks().predict_action_chunk, {"seed": 7, "protocol": "lift-v1"}, "seed: expected as protocol lift-v1"),
+        (
+            Chunks().predict_action_chunk,
+            {"control": "compiled", "protocol": "lift-v1"},
+            "control: expected as protocol lift-v1",
+        ),
     ):
         with pytest.raises(ValueError, match=words):
             actrm.evaluate(policy, name="mine", zoo=tmp_path, **options)

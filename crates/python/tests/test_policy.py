@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import pickle
+import shutil
 import threading
 from pathlib import Path
 from types import MappingProxyType
@@ -10,7 +12,7 @@ from types import MappingProxyType
 import actrm
 import numpy as np
 import pytest
-from conftest import LIFT, computed, train
+from conftest import LIFT, ROOT, computed, train
 
 ENTRIES = ("door-act", "lift-act", "nutassemblysquare-act", "pickplacecan-act", "stack-act", "stackthreecubes-act")
 # small ones, of every kind that remembers, draws or copies
@@ -42,6 +44,20 @@ def test_chunks_are_what_the_entry_computes(zoo: Path, name: str) -> None:
     ours = np.stack([policy.predict_action_chunk(one) for one in asked])
     assert ours.shape == (5, policy.action_horizon, 7)
     np.testing.assert_array_equal(ours.view(np.uint32), wanted.view(np.uint32))
+
+
+def test_a_checkpoint_in_several_files_is_the_same_policy(tmp_path: Path) -> None:
+    """LeRobot's, with Hugging Face's list of its files."""
+    whole, parts = ROOT / "crates/interchange/tests/fixtures/lerobot/environment_raw", tmp_path / "parts"
+    shutil.copytree(whole, parts)
+    part = (parts / "model.safetensors").rename(parts / "model-00001-of-00001.safetensors")
+    content = part.read_bytes()
+    header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])
+    files = {name: part.name for name in header if name != "__metadata__"}
+    (parts / "model.safetensors.index.json").write_text(json.dumps({"weight_map": files}))
+    one, two = actrm.load_policy(whole), actrm.load_policy(parts)
+    for seen in observations(one, 2):
+        np.testing.assert_array_equal(two.predict_action_chunk(seen), one.predict_action_chunk(seen))
 
 
 @pytest.mark.parametrize("kind", KINDS)

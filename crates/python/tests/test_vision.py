@@ -96,6 +96,8 @@ def test_pictures_are_taken_as_they_come(seen: Path, entry: Path) -> None:
         policy.select_action({**one, CAMERAS[0]: one[CAMERAS[0]].astype(np.int64)})
     with pytest.raises(actrm.Error, match=rf"{CAMERAS[1]} has shape \[3, 8, {SIDE}\], expected \[{SIDE}, {SIDE}, 3\]"):
         policy.select_action({**one, CAMERAS[1]: one[CAMERAS[1]][:, :8]})
+    with pytest.raises(actrm.Error, match=rf"{CAMERAS[1]} has shape \[3, 0, {SIDE}\]"):
+        policy.select_action({**one, CAMERAS[1]: bright[0][CAMERAS[1]][:, :0]})
     with pytest.raises(actrm.Error, match=f"{CAMERAS[1]} is missing"):
         policy.select_action({key: value for key, value in one.items() if key != CAMERAS[1]})
 

@@ -1,12 +1,12 @@
 //! The two tables and the answers.
 
-use dataset::{Dataset, DatasetError, Wide};
+use dataset::{Dataset, DatasetError, Feature, Wide};
 use polars::prelude::{
     AnyValue, Column as Series, DataFrame, IntoColumn, IntoLazy, NamedFrom, PolarsError, Series as Values,
 };
 use polars::sql::SQLContext;
 use serde_json::Value;
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// Why a query has no answer.
 #[derive(Debug, thiserror::Error)]
@@ -67,9 +67,10 @@ fn both(dataset: &Dataset) -> Result<[(&'static str, DataFrame); 2], QueryError>
     let made = |table, columns: Vec<Series>, rows| {
         DataFrame::new(rows, columns).map_err(|e| QueryError::Table { table, source: e.into() })
     };
+    let wide = dataset.wide()?;
     Ok([
-        ("frames", made("frames", frames(dataset)?, dataset.frames())?),
-        ("episodes", made("episodes", episodes(dataset), dataset.episodes().len())?),
+        ("frames", made("frames", frames(dataset, &wide)?, dataset.frames())?),
+        ("episodes", made("episodes", episodes(dataset, &wide), dataset.episodes().len())?),
     ])
 }
 
@@ -78,8 +79,7 @@ fn both(dataset: &Dataset) -> Result<[(&'static str, DataFrame); 2], QueryError>
 /// # Errors
 /// When the engine refuses the statement.
 pub fn query(dataset: &Dataset, sql: &str) -> Result<QueryResult, QueryError> {
-    let first = sql.trim_start_matches(|c: char| c.is_whitespace() || c == '(');
-    let first = first.split(|c: char| !c.is_alphanumeric()).next().unwrap_or_default();
+    let first = first_word(sql);
     if !["SELECT", "WITH", "SHOW", "EXPLAIN"].iter().any(|word| first.eq_ignore_ascii_case(word)) {
         return Err(QueryError::NoQuestion { sql: sql.to_owned(), found: first.to_owned() });
     }
@@ -97,6 +97,20 @@ pub fn query(dataset: &Dataset, sql: &str) -> Result<QueryResult, QueryError> {
         }
     }
     Ok(QueryResult { columns, rows })
+}
+
+/// The first word of a statement, behind comments and brackets.
+fn first_word(sql: &str) -> &str {
+    let mut rest = sql;
+    loop {
+        rest = rest.trim_start_matches(|c: char| c.is_whitespace() || c == '(');
+        let behind = match (rest.strip_prefix("--"), rest.strip_prefix("/*")) {
+            (Some(comment), _) => comment.split_once('\n'),
+            (None, Some(comment)) => comment.split_once("*/"),
+            (None, None) => return rest.split(|c: char| !c.is_alphanumeric()).next().unwrap_or_default(),
+        };
+        rest = behind.map_or("", |(_, rest)| rest);
+    }
 }
 
 /// Table, column and type of everything that can be asked for.
@@ -118,7 +132,7 @@ fn json(value: AnyValue<'_>) -> Value {
         AnyValue::Null => Value::Null,
         AnyValue::Boolean(b) => b.into(),
         AnyValue::Float32(v) => shortest(v),
-        AnyValue::Float64(v) => v.into(),
+        AnyValue::Float64(v) => float(v),
         AnyValue::String(s) => s.into(),
         AnyValue::StringOwned(s) => s.to_string().into(),
         AnyValue::UInt64(v) => v.into(),
@@ -132,7 +146,12 @@ fn json(value: AnyValue<'_>) -> Value {
 
 /// An f32 as the shortest decimal that reads back as itself, not as its f64 neighbour's digits.
 fn shortest(value: f32) -> Value {
-    value.to_string().parse::<f64>().map_or(Value::Null, Value::from)
+    value.to_string().parse().map_or(Value::Null, float)
+}
+
+/// A number; what JSON has no number for as the text `NaN`, `inf` or `-inf`, for it is not missing.
+fn float(value: f64) -> Value {
+    if value.is_finite() { value.into() } else { value.to_string().into() }
 }
 
 fn column<T>(name: &str, values: T) -> Series
@@ -170,7 +189,7 @@ fn dimension<T: Copy>(all: &[T], d: usize, dim: usize) -> Vec<T> {
     all.iter().skip(d).step_by(dim).copied().collect()
 }
 
-fn frames(dataset: &Dataset) -> Result<Vec<Series>, DatasetError> {
+fn frames(dataset: &Dataset, wide: &BTreeMap<String, Wide>) -> Result<Vec<Series>, DatasetError> {
     let episodes = dataset.episodes();
     let total = dataset.frames();
     let mut episode_index = Vec::with_capacity(total);
@@ -208,15 +227,22 @@ fn frames(dataset: &Dataset) -> Result<Vec<Series>, DatasetError> {
         _ => format!("{}_{d}", plain(name)),
     };
     let known = || dataset.info().features.0.iter().filter_map(|(name, f)| Some((name, f, dataset.column(name)?)));
-    let wide = dataset.wide()?;
+    let texts = dataset.texts()?;
     // no number of one feature takes the name of another
-    let reserved: BTreeSet<String> =
+    let mut reserved: BTreeSet<String> =
         known().flat_map(|(name, _, values)| (0..values.dim).map(move |d| own(name, values.dim, d))).collect();
+    reserved.extend(texts.keys().map(|name| plain(name)));
+    let given = |feature: &Feature, d: usize| feature.names.get(d).and_then(Value::as_str).map(plain);
+    // nor one that two features give their numbers, as LeRobot does with joints in actions and states
+    let mut claimed = BTreeSet::new();
+    for (_, feature, values) in known().filter(|(_, _, values)| values.dim > 1) {
+        let names: BTreeSet<String> = (0..values.dim).filter_map(|d| given(feature, d)).collect();
+        reserved.extend(names.into_iter().filter(|name| !claimed.insert(name.clone())));
+    }
     for (name, feature, values) in known() {
         for d in 0..values.dim {
-            let given = feature.names.get(d).and_then(Value::as_str).map(plain);
             let free = |given: &String| values.dim > 1 && !taken.contains(given) && !reserved.contains(given);
-            let unique = given.filter(free).unwrap_or_else(|| own(name, values.dim, d));
+            let unique = given(feature, d).filter(free).unwrap_or_else(|| own(name, values.dim, d));
             let unique = named(unique, &mut taken);
             let data = dimension(values.data, d, values.dim);
             columns.push(match (wide.get(name), feature.dtype.as_str()) {
@@ -227,10 +253,14 @@ fn frames(dataset: &Dataset) -> Result<Vec<Series>, DatasetError> {
             });
         }
     }
+    for (name, texts) in &texts {
+        let of_frames: Vec<Option<&str>> = (0..total).map(|frame| texts.get(frame)).collect();
+        columns.push(column(&named(plain(name), &mut taken), of_frames));
+    }
     Ok(columns)
 }
 
-fn episodes(dataset: &Dataset) -> Vec<Series> {
+fn episodes(dataset: &Dataset, wide: &BTreeMap<String, Wide>) -> Vec<Series> {
     let episodes = dataset.episodes();
     let mut columns = vec![
         column("episode_index", episodes.iter().map(|e| e.index as i64).collect::<Vec<_>>()),
@@ -239,7 +269,10 @@ fn episodes(dataset: &Dataset) -> Vec<Series> {
         column("task", episodes.iter().map(|e| e.tasks.first().cloned().unwrap_or_default()).collect::<Vec<_>>()),
     ];
     if let Some(reward) = dataset.column("next.reward") {
-        let returns = episodes.iter().map(|e| reward.data[e.from..e.to].iter().map(|&v| f64::from(v)).sum());
+        let returns = episodes.iter().map(|e| match wide.get("next.reward") {
+            Some(exact) => exact.sum(e.from..e.to),
+            None => reward.data[e.from..e.to].iter().map(|&v| f64::from(v)).sum(),
+        });
         columns.push(column("return", returns.collect::<Vec<f64>>()));
     }
     if let Some(success) = dataset.column("next.success") {

@@ -66,6 +66,35 @@ fn no_number_takes_the_name_of_a_feature() {
     }
 }
 
+/// LeRobot calls joints the same in actions and in states.
+#[test]
+fn a_name_of_two_features_is_the_name_of_neither() {
+    let dir = tempfile::tempdir().unwrap();
+    drop(set(dir.path()));
+    let path = dir.path().join("set/meta/info.json");
+    std::fs::remove_dir_all(dir.path().join("set/actrm")).unwrap();
+    let mut info: serde_json::Value = serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
+    for feature in ["action", "observation.state"] {
+        info["features"][feature]["names"][0] = json!("joint_0_pos");
+    }
+    std::fs::write(&path, info.to_string()).unwrap();
+    let tables = query::tables(&Dataset::open(&dir.path().join("set")).unwrap()).unwrap();
+    let has = |name: &str| tables.iter().any(|(_, column, _)| column == name);
+    assert!(has("action_0") && has("observation_state_0") && !has("joint_0_pos"), "{tables:?}");
+}
+
+#[test]
+fn texts_are_columns_and_what_is_no_number_is_not_missing() {
+    let fixture = Path::new(env!("CARGO_MANIFEST_DIR")).join("../dataset/tests/fixtures/lerobot_texts");
+    let set = Dataset::open(&fixture).unwrap();
+    let rows = |sql: &str| query::query(&set, sql).unwrap().rows;
+    assert_eq!(rows("SELECT note FROM frames WHERE index = 3"), [[json!("step 0 of 1")]]);
+    let odd = "/* numbers */ SELECT 0.0 / 0.0 AS nan, 1.0 / 0.0 AS more, -1.0 / 0.0 AS less -- of floats";
+    assert_eq!(rows(odd), [[json!("NaN"), json!("inf"), json!("-inf")]]);
+    let single = "-- float32\nSELECT CAST(-1.0 / 0.0 AS REAL) AS less";
+    assert_eq!(rows(single), [[json!("-inf")]]);
+}
+
 /// A set that another program wrote: times of a clock, nanoseconds, two tasks in an episode.
 #[test]
 fn numbers_times_and_tasks_are_those_of_the_frames() {
@@ -96,6 +125,10 @@ fn numbers_times_and_tasks_are_those_of_the_frames() {
     let rows = query::query(&set, "SELECT next_reward, timestamp, task FROM frames ORDER BY index LIMIT 2").unwrap();
     let expected = [json!([nanoseconds(0), 0.0, "open"]), json!([nanoseconds(1), 1.0, "close"])];
     assert_eq!(rows.rows.into_iter().map(serde_json::Value::from).collect::<Vec<_>>(), expected);
+    let returns = query::query(&set, "SELECT \"return\" FROM episodes ORDER BY episode_index").unwrap();
+    let sum = |e: &dataset::EpisodeMeta| (e.from..e.to).map(|row| nanoseconds(row) as f64).sum::<f64>();
+    let sums: Vec<f64> = returns.rows.iter().map(|row| row[0].as_f64().unwrap()).collect();
+    assert_eq!(sums, set.episodes().iter().map(sum).collect::<Vec<_>>());
     let lists = query::query(&set, "SELECT ARRAY_AGG(episode_index) AS all, COUNT(*) AS n FROM episodes").unwrap();
     assert_eq!(lists.rows, [[json!([0, 1, 2]), json!(3)]]);
 }

@@ -39,15 +39,15 @@ fn cut_short(name: &str, kind: &str) -> impl Fn() -> VideoError {
 }
 
 /// The fields of a table behind its version, and its count of entries of `width` bytes, which are all there.
-fn table<'a>(name: &'a str, kind: &'a str, data: &'a [u8], width: usize) -> Result<(u8, usize, Fields<'a>)> {
+fn table<'a>(name: &'a str, kind: &'a str, data: &'a [u8], width: usize) -> Result<(usize, Fields<'a>)> {
     let mut fields = Fields(data);
     let short = cut_short(name, kind);
-    let version = fields.version().ok_or_else(&short)?;
+    fields.version().ok_or_else(&short)?;
     let count = fields.u32().ok_or_else(&short)? as usize;
     if fields.0.len() / width < count {
         return Err(short());
     }
-    Ok((version, count, fields))
+    Ok((count, fields))
 }
 
 fn sizes(name: &str, stbl: &[u8], file_bytes: u64) -> Result<Vec<u32>> {
@@ -103,21 +103,21 @@ fn sizes(name: &str, stbl: &[u8], file_bytes: u64) -> Result<Vec<u32>> {
 /// Places of the chunks.
 fn chunks(name: &str, stbl: &[u8]) -> Result<Vec<u64>> {
     if let Some(data) = child(name, "stbl", stbl, *b"stco")? {
-        let (_, count, mut fields) = table(name, "stco", data, 4)?;
+        let (count, mut fields) = table(name, "stco", data, 4)?;
         let short = cut_short(name, "stco");
         return (0..count).map(|_| fields.u32().map(u64::from).ok_or_else(&short)).collect();
     }
     let Some(data) = child(name, "stbl", stbl, *b"co64")? else {
         return Err(bad_box(name, "stbl", "a box stco or co64 in it", "neither"));
     };
-    let (_, count, mut fields) = table(name, "co64", data, 8)?;
+    let (count, mut fields) = table(name, "co64", data, 8)?;
     let short = cut_short(name, "co64");
     (0..count).map(|_| fields.u64().ok_or_else(&short)).collect()
 }
 
 fn offsets(name: &str, stbl: &[u8], sizes: &[u32], file_bytes: u64) -> Result<Vec<u64>> {
     let chunks = chunks(name, stbl)?;
-    let (_, count, mut fields) = table(name, "stsc", needed(name, "stbl", stbl, *b"stsc")?, 12)?;
+    let (count, mut fields) = table(name, "stsc", needed(name, "stbl", stbl, *b"stsc")?, 12)?;
     let short = cut_short(name, "stsc");
     // runs of chunks with equally many samples: each from its first chunk up to the next run's
     let mut runs = Vec::with_capacity(count);
@@ -163,7 +163,7 @@ fn offsets(name: &str, stbl: &[u8], sizes: &[u32], file_bytes: u64) -> Result<Ve
 }
 
 fn times(name: &str, stbl: &[u8], places: &mut [Place]) -> Result<()> {
-    let (_, count, mut fields) = table(name, "stts", needed(name, "stbl", stbl, *b"stts")?, 8)?;
+    let (count, mut fields) = table(name, "stts", needed(name, "stbl", stbl, *b"stts")?, 8)?;
     let short = cut_short(name, "stts");
     let wrong = |kind, found: u64| {
         bad_box(name, kind, format!("times of {} samples", places.len()), format!("times of {found}"))
@@ -186,12 +186,12 @@ fn times(name: &str, stbl: &[u8], places: &mut [Place]) -> Result<()> {
     }
     let mut delays = Vec::new();
     if let Some(data) = child(name, "stbl", stbl, *b"ctts")? {
-        let (version, count, mut fields) = table(name, "ctts", data, 8)?;
+        let (count, mut fields) = table(name, "ctts", data, 8)?;
         let short = cut_short(name, "ctts");
         for _ in 0..count {
             let (samples, delay) = (fields.u32().ok_or_else(&short)?, fields.u32().ok_or_else(&short)?);
-            // from version 1 on they have a sign
-            let delay = if version == 0 { i64::from(delay) } else { i64::from(delay as i32) };
+            // from version 1 on they have a sign; writers, and FFmpeg, do not mind the version
+            let delay = i64::from(delay as i32);
             if delays.len() as u64 + u64::from(samples) > places.len() as u64 {
                 return Err(wrong("ctts", delays.len() as u64 + u64::from(samples)));
             }
@@ -210,7 +210,7 @@ fn times(name: &str, stbl: &[u8], places: &mut [Place]) -> Result<()> {
 
 fn keys(name: &str, stbl: &[u8], places: &mut [Place]) -> Result<()> {
     let Some(data) = child(name, "stbl", stbl, *b"stss")? else { return Ok(()) };
-    let (_, count, mut fields) = table(name, "stss", data, 4)?;
+    let (count, mut fields) = table(name, "stss", data, 4)?;
     let short = cut_short(name, "stss");
     places.iter_mut().for_each(|p| p.key = false);
     let total = places.len();

@@ -77,6 +77,22 @@ fn a_frame_before_the_key_frame_of_an_open_group_needs_the_group_before() {
 }
 
 #[test]
+fn delays_below_zero_are_read_whatever_the_version_of_their_table() {
+    let mut bytes = std::fs::read(fixture("h264_open_group.mp4")).unwrap();
+    let expected = Video::from_bytes("f", bytes.clone()).unwrap().info().timestamps.clone();
+    let find = |kind: &[u8]| bytes.windows(4).position(|w| w == kind).unwrap() + 4;
+    let (ctts, elst) = (find(b"ctts"), find(b"elst"));
+    let entries = u32::from_be_bytes(bytes[ctts + 4..ctts + 8].try_into().unwrap()) as usize;
+    // all of them by two frames, and the edit list with them: the same times
+    for at in (0..entries).map(|entry| ctts + 12 + 8 * entry).chain([elst + 12]) {
+        let ticks = i32::from_be_bytes(bytes[at..at + 4].try_into().unwrap()) - 1024;
+        bytes[at..at + 4].copy_from_slice(&ticks.to_be_bytes());
+    }
+    assert_eq!(bytes[ctts], 0);
+    assert_eq!(Video::from_bytes("f", bytes).unwrap().info().timestamps, expected);
+}
+
+#[test]
 fn samples_of_whole_stretches_make_another_file_of_the_same_pictures() {
     let video = Video::open(&fixture("av1_agentview.mp4")).unwrap();
     let keys: Vec<usize> = (0..36).filter(|&i| video.samples(i..i + 1).is_ok()).collect();

@@ -79,17 +79,11 @@ proptest! {
 fn the_same_pictures_make_the_same_bytes() {
     let rate = Rate::of(20.0).unwrap();
     let pictures: Vec<_> = (0..6).map(|i| picture(84, 84, i, 3)).collect();
-    let samples = || encode(84, 84, rate, &pictures, &EncodeOptions::default());
-    let first = file(84, 84, rate, &[samples()]);
-    assert_eq!(
-        first,
-        std::thread::spawn({
-            let again = samples();
-            move || file(84, 84, rate, &[again])
-        })
-        .join()
-        .unwrap()
-    );
+    let made = || file(84, 84, rate, &[encode(84, 84, rate, &pictures, &EncodeOptions::default())]);
+    let first = made();
+    // on another thread
+    let again = std::thread::scope(|scope| scope.spawn(made).join().unwrap());
+    assert_eq!(first, again);
 }
 
 #[test]

@@ -19,6 +19,8 @@ use crate::results::{EvaluationRecord, Execution, Protocol, Seeds};
 
 /// The files of `protocols/`, built into the binary.
 const BUILT_IN: &[(&str, &str)] = include!(concat!(env!("OUT_DIR"), "/protocols.rs"));
+/// The rule of which expected and found are told.
+const VERSIONS: &str = "versions";
 /// More seeds than a block has, and more steps than an episode takes.
 const MOST: u64 = 1_000_000;
 
@@ -140,18 +142,53 @@ impl NamedProtocol {
 
     /// The block that an evaluation ran, whole and by these rules; nothing for any other.
     pub fn block_of(&self, record: &EvaluationRecord) -> Option<Block> {
-        let rules = &record.protocol;
-        let same = (rules.task == self.task && rules.max_steps == self.max_steps && rules.control == self.control && rules.perturbation.is_none())
-            && rules.rules == Protocol::RULES
-            // the task's own environment; those of a suite, `suite/task`, are of the suite's class
-            && (rules.env_name == self.task || self.task.contains('/'))
-            && rules.env_module.is_none()
-            && rules.env_args_sha256.is_none()
-            && record.changed_sources().is_empty()
-            && self.execution.is_none_or(|execution| execution == record.execution)
-            && self.versions.iter().all(|(name, version)| record.versions.get(name) == Some(version));
         let whole = |block: &Block| self.seeds(*block) == record.seeds;
-        [Block::Test, Block::Dev].into_iter().find(whole).filter(|_| same && record.shard.is_none())
+        let block = [Block::Test, Block::Dev].into_iter().find(whole);
+        block.filter(|_| record.shard.is_none() && self.broken_by(record).is_none())
+    }
+
+    /// The first rule that an evaluation did not keep to, whatever its seeds.
+    fn broken_by(&self, record: &EvaluationRecord) -> Option<&'static str> {
+        let rules = &record.protocol;
+        let fixed = |(name, version): (&String, &String)| record.versions.get(name) == Some(version);
+        Some(if rules.task != self.task {
+            "task"
+        } else if rules.max_steps != self.max_steps {
+            "max_steps"
+        } else if rules.control != self.control {
+            "control loop"
+        } else if rules.perturbation.is_some() {
+            "perturbation"
+        } else if rules.rules != Protocol::RULES {
+            "version of the rules"
+        } else if rules.env_name != self.task && !self.task.contains('/') {
+            // those of a suite, `suite/task`, are of the suite's class
+            "environment"
+        } else if rules.env_module.is_some() {
+            "environment module"
+        } else if rules.env_args_sha256.is_some() {
+            "robot or controller"
+        } else if !record.changed_sources().is_empty() {
+            "source of the simulator"
+        } else if self.execution.is_some_and(|execution| execution != record.execution) {
+            "execution"
+        } else if !self.versions.iter().all(fixed) {
+            VERSIONS
+        } else {
+            return None;
+        })
+    }
+
+    /// What is said of an evaluation that ran a block of this protocol, but does not count as its; nothing where it does.
+    pub fn doubt(&self, record: &EvaluationRecord) -> Option<String> {
+        let rule = self.broken_by(record)?;
+        let (entry, name) = (&record.entry, &self.name);
+        Some(match rule {
+            VERSIONS => {
+                format!("{entry}: not of {name}, which fixes {:?}: found {:?}", self.versions, record.versions)
+            }
+            rule => format!("{entry}: not of {name}, which has another {rule}"),
+        })
     }
 }
 
@@ -300,6 +337,7 @@ mod tests {
         assert_eq!(protocol.block_of(&record), Some(Block::Dev));
         record.seeds = Seeds { start: 40_000, count: 200 };
         assert_eq!(protocol.block_of(&record), Some(Block::Test));
+        assert_eq!(protocol.doubt(&record), None);
         #[allow(clippy::type_complexity)]
         let changes: [fn(&mut EvaluationRecord); 10] = [
             |r| r.seeds.count = 199,
@@ -318,6 +356,15 @@ mod tests {
             change(&mut other);
             assert_eq!(protocol.block_of(&other), None, "{other:?}");
         }
+        let doubt = |change: fn(&mut EvaluationRecord)| {
+            let mut other = record.clone();
+            change(&mut other);
+            protocol.doubt(&other).unwrap()
+        };
+        let versions = doubt(|r| drop(r.versions.insert("mujoco".into(), "3.9.0".into())));
+        assert!(versions.contains("3.3.7") && versions.contains("3.9.0"), "{versions}");
+        let robot = doubt(|r| r.protocol.env_args_sha256 = Some("0".repeat(64)));
+        assert_eq!(robot, "a@1: not of lift-v1, which has another robot or controller");
     }
 
     #[test]

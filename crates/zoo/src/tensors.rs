@@ -1,6 +1,7 @@
 //! Named tensors to safetensors bytes and back, the same bytes for the same tensors.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::io::Read;
 use std::path::Path;
 
 use candle_core::{DType, Device, Tensor};
@@ -9,6 +10,7 @@ use safetensors::SafeTensors;
 use safetensors::tensor::{Dtype, TensorView, serialize};
 
 use crate::ZooError;
+use crate::files::open_file;
 
 /// The one metadata key: safetensors keeps metadata in a hash map, and one key has one order.
 const METADATA_KEY: &str = "actrm";
@@ -129,7 +131,7 @@ struct Index {
 
 fn read_parts(index: &Path) -> Result<BTreeMap<String, Tensor>, ZooError> {
     let malformed = |reason: String| ZooError::Malformed { path: index.to_owned(), reason };
-    let text = std::fs::read(index).map_err(ZooError::io("read", index))?;
+    let text = content(index)?;
     let Index { weight_map } =
         serde_json::from_slice(&text).map_err(|e| malformed(format!("not a list of safetensors files: {e}")))?;
     let mut all = BTreeMap::new();
@@ -204,8 +206,14 @@ pub fn halved(path: &Path, tensors: BTreeMap<String, Tensor>) -> Result<BTreeMap
 /// # Errors
 /// A file that cannot be read or is something else.
 pub fn read(path: &Path) -> Result<Contents, ZooError> {
-    let bytes = std::fs::read(path).map_err(ZooError::io("read", path))?;
-    from_bytes(path, &bytes)
+    from_bytes(path, &content(path)?)
+}
+
+/// The content of a regular file; a pipe or a device could be read for ever.
+fn content(path: &Path) -> Result<Vec<u8>, ZooError> {
+    let mut bytes = Vec::new();
+    open_file(path).and_then(|mut file| file.read_to_end(&mut bytes)).map_err(ZooError::io("read", path))?;
+    Ok(bytes)
 }
 
 /// Refuses values that are no finite numbers.
@@ -250,6 +258,18 @@ mod tests {
             refused.contains("x.safetensors: tensor `w`: expected numbers up to 65504 for f16, found 100000"),
             "{refused}"
         );
+    }
+
+    #[test]
+    fn a_pipe_in_place_of_weights_or_their_list_is_refused() {
+        use rustix::fs::{CWD, FileType, Mode, mknodat};
+        for name in ["model.safetensors", "model.safetensors.index.json"] {
+            let folder = tempfile::tempdir().unwrap();
+            mknodat(CWD, folder.path().join(name), FileType::Fifo, Mode::RWXU, 0).unwrap();
+            let error = read_weights(&folder.path().join("model.safetensors")).unwrap_err();
+            let cause = std::error::Error::source(&error).unwrap().to_string();
+            assert!(error.to_string().contains(name) && cause.contains("found a pipe"), "{error}: {cause}");
+        }
     }
 
     /// A safetensors file of one tensor `w` of these bytes.

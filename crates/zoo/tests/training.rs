@@ -320,6 +320,7 @@ fn a_loss_that_is_not_finite_stops_the_run_and_keeps_the_last_good_checkpoint() 
     assert!(!tensor.is_empty() && error.to_string().starts_with(&format!("step {step}: ")));
     assert_eq!(checkpoint.as_ref(), saved.last());
     if let Some(path) = checkpoint {
+        assert!(error.to_string().ends_with(&path.display().to_string()), "{error}");
         let kept = Checkpoint::latest(path.parent().unwrap()).unwrap().unwrap();
         for (name, tensor) in &kept.tensors {
             let values = tensor.flatten_all().unwrap().to_vec1::<f32>().unwrap();

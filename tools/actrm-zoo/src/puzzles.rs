@@ -152,6 +152,7 @@ pub struct TraceOptions<'a> {
     pub task: Option<&'a str>,
     pub givens: Option<usize>,
     pub json: bool,
+    /// A new file, in a folder that is there.
     pub svg: Option<&'a Path>,
 }
 
@@ -175,7 +176,6 @@ pub fn trace(entry: &Entry, options: &TraceOptions<'_>, of_robots: Option<&str>)
     let trace = study::puzzle::trace(&solver, task, givens, options.index.unwrap_or(0), depth)?;
     match options.svg {
         Some(path) => {
-            let _parents = cli::make_parent(path)?;
             write_atomic(path, trace.to_svg().as_bytes())?;
             cli::print(&(shown(path) + "\n"))?;
         }

@@ -15,6 +15,11 @@ use zoo::results::StoredEvaluation;
 
 use crate::places::of_entry;
 
+/// Seconds that a worker may take for a step.
+const STEP_TIMEOUT: u64 = 30;
+/// Seconds that a worker may take to start.
+const START_TIMEOUT: u64 = 300;
+
 /// How entries are run.
 #[derive(Args)]
 pub struct RunArgs {
@@ -36,14 +41,34 @@ pub struct RunArgs {
     #[arg(long)]
     pub force: bool,
     /// Seconds without an answer to a step after which a worker is restarted
-    #[arg(long, value_name = "S", default_value_t = 30, value_parser = clap::value_parser!(u64).range(1..=86_400))]
+    #[arg(long, value_name = "S", default_value_t = STEP_TIMEOUT, value_parser = clap::value_parser!(u64).range(1..=86_400))]
     step_timeout: u64,
     /// Seconds that a worker may take to start, with imports and compilation
-    #[arg(long, value_name = "S", default_value_t = 300, value_parser = clap::value_parser!(u64).range(1..=86_400))]
+    #[arg(long, value_name = "S", default_value_t = START_TIMEOUT, value_parser = clap::value_parser!(u64).range(1..=86_400))]
     start_timeout: u64,
     /// Folder for the standard error output of the workers
     #[arg(long, value_name = "DIR")]
     pub worker_logs: Option<PathBuf>,
+}
+
+impl RunArgs {
+    /// The first option that only means something where episodes are run, if one is given.
+    pub fn given(&self) -> Option<&'static str> {
+        let SimulatorArgs { workers, env_module, python } = &self.simulator;
+        let options = [
+            ("--max-steps", self.max_steps.is_some()),
+            ("--workers", workers.is_some()),
+            ("--env-module", env_module.is_some()),
+            ("--python", python.is_some()),
+            ("--robots", !self.robots.is_empty()),
+            ("--control", self.control != Control::Compiled),
+            ("--force", self.force),
+            ("--step-timeout", self.step_timeout != STEP_TIMEOUT),
+            ("--start-timeout", self.start_timeout != START_TIMEOUT),
+            ("--worker-logs", self.worker_logs.is_some()),
+        ];
+        options.into_iter().find(|(_, given)| *given).map(|(option, _)| option)
+    }
 }
 
 /// The environment of an entry's demonstrations, unless the command line says otherwise: what simulators are started for.

@@ -20,7 +20,7 @@ mod text;
 mod video_writer;
 
 pub use command::{dressed, end, every_command_shows_examples, parse};
-pub use output::{Parents, make_parent, note, print, print_json};
+pub use output::{Parents, make_parent, new_file, note, print, print_json, refuse_existing};
 pub use screen::Screen;
 pub use simulator::{SimulatorArgs, close};
 pub use stop::{INTERRUPTED, Stop};

@@ -53,6 +53,15 @@ pub fn bytes(text: &str) -> Result<u64, String> {
     }
 }
 
+/// The side of a square video on the command line, in pixels, at most `MOST`.
+///
+/// # Errors
+/// Anything else, in words.
+pub fn video_side<const MOST: u16>(text: &str) -> Result<u16, String> {
+    let fits = |side: &u16| *side <= MOST && video::check_size(usize::from(*side), usize::from(*side)).is_ok();
+    text.parse().ok().filter(fits).ok_or_else(|| format!("expected an even number from 16 to {MOST}"))
+}
+
 /// How many simulators to start: one a core unless another number was asked for.
 ///
 /// # Errors
@@ -78,7 +87,7 @@ pub fn workers(asked: Option<usize>) -> Result<usize> {
 }
 
 /// Memory that can be had, in bytes, where the system tells.
-pub fn available_memory() -> Option<u64> {
+fn available_memory() -> Option<u64> {
     let text = std::fs::read_to_string("/proc/meminfo").ok()?;
     let line = text.lines().find_map(|line| line.strip_prefix("MemAvailable:"))?;
     line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok()?.checked_mul(1024)
@@ -94,6 +103,14 @@ mod tests {
         assert_eq!(["500M", "2G", "1.5g", "7", "7k"].map(bytes), [500e6, 2e9, 1.5e9, 7.0, 7e3].map(|x| Ok(x as u64)));
         for wrong in ["", "G", "-1G", "2Q", "nan", "1e30T", "2 G 1"] {
             assert!(bytes(wrong).unwrap_err().contains("500M or 2G"), "{wrong}");
+        }
+    }
+
+    #[test]
+    fn sides_of_videos_are_even() {
+        assert_eq!(["16", "84", "256"].map(video_side::<256>), [Ok(16), Ok(84), Ok(256)]);
+        for wrong in ["85", "14", "258", "-16", ""] {
+            assert_eq!(video_side::<256>(wrong).unwrap_err(), "expected an even number from 16 to 256", "{wrong}");
         }
     }
 

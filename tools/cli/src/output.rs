@@ -3,7 +3,7 @@
 use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, bail};
 use serde::Serialize;
 
 use crate::text::plain;
@@ -51,6 +51,26 @@ pub fn make_parent(path: &Path) -> Result<Parents> {
     let folder = made.0.first().map_or(Ok(()), std::fs::create_dir_all);
     folder.with_context(|| format!("cannot create the folder of {}", crate::shown(path)))?;
     Ok(made)
+}
+
+/// Refuses a file that is there already, before the work whose result would take its place.
+///
+/// # Errors
+/// There is one.
+pub fn refuse_existing(path: &Path) -> Result<()> {
+    if path.symlink_metadata().is_ok() {
+        bail!("{}: exists already; choose another path or remove it first", crate::shown(path));
+    }
+    Ok(())
+}
+
+/// What a new file needs before the work begins: nothing there of its name, and the folders that it will be in.
+///
+/// # Errors
+/// As [`refuse_existing`] and [`make_parent`].
+pub fn new_file(path: &Path) -> Result<Parents> {
+    refuse_existing(path)?;
+    make_parent(path)
 }
 
 impl Drop for Parents {

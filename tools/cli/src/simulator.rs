@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use anyhow::Result;
+use anyhow::{Result, anyhow};
 use rollout::{Pool, PoolOptions, Python, WorkerSpec, find_python, harness_folder};
 use serde_json::Value;
 
@@ -41,11 +41,13 @@ impl SimulatorArgs {
         Ok(spec)
     }
 
-    /// The same for an environment that was recorded with robomimic's `env_args`: its robots, its controllers, its module.
+    /// The same for an environment that was recorded with robomimic's `env_args`: its robots, its controllers.
     ///
     /// # Errors
-    /// No Python, no harness.
+    /// It was recorded with a module that the user does not name; no Python, no harness.
     pub fn recorded_spec(&self, task: &str, env_args: Option<&Value>) -> Result<WorkerSpec> {
+        rollout::check_module(env_args.and_then(rollout::recorded_module), self.env_module.as_deref())
+            .map_err(|reason| anyhow!("task {task}: {reason}"))?;
         Ok(self.spec(task)?.recorded(env_args))
     }
 
@@ -79,4 +81,17 @@ pub fn close(pool: Pool) {
         note(&format!("note: {}", incident.text));
     }
     pool.close();
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_recording_names_no_module_for_the_user() {
+        let args = SimulatorArgs { workers: None, env_module: None, python: None };
+        let env_args = serde_json::json!({"env_name": "Lift", "env_module": {"name": "theirs"}});
+        let refused = args.recorded_spec("Lift", Some(&env_args)).map(drop).expect_err("nobody named it").to_string();
+        assert!(refused.contains("task Lift") && refused.contains("\"theirs\""), "{refused}");
+    }
 }

@@ -26,7 +26,9 @@ impl VideoWriter {
     pub fn begin(path: &Path, size: (usize, usize), rate: f64) -> Result<Self> {
         let shown = crate::shown(path);
         let Some(rate) = Rate::of(rate) else {
-            bail!("video {shown}: frames per second: expected 1 or more, found {rate}")
+            bail!(
+                "video {shown}: frames per second: expected a fraction with a denominator of 1 to 100 or 1001, found {rate}"
+            )
         };
         let encoder = Encoder::new(size.1, size.0, rate, &OPTIONS).with_context(|| format!("video {shown}"))?;
         Ok(Self { path: path.to_owned(), size, rate, encoder })
@@ -109,5 +111,6 @@ mod tests {
         assert!(error(write_video(&path, &[image(0), other], 20.0)).contains("expected images of 32x48"));
         let odd = Image { height: 33, width: 48, rgb: vec![0; 33 * 48 * 3] };
         assert!(error(write_video(&path, &[odd], 20.0)).contains("odd"));
+        assert!(error(write_video(&path, &images, 23.987_65)).contains("1 to 100 or 1001, found 23.98765"));
     }
 }

@@ -10,6 +10,7 @@ use arrow_array::cast::AsArray;
 use arrow_array::types::{Float64Type, Int64Type};
 use arrow_schema::DataType;
 use std::collections::BTreeMap;
+use std::ops::Range;
 use std::path::Path;
 
 /// The numbers of a column, row after row.
@@ -47,6 +48,14 @@ impl Wide {
             }
         }
         Ok(if whole { Self::Longs(longs) } else { Self::Doubles(doubles) })
+    }
+
+    /// The sum of some of the numbers.
+    pub fn sum(&self, numbers: Range<usize>) -> f64 {
+        match self {
+            Self::Doubles(all) => all[numbers].iter().sum(),
+            Self::Longs(all) => all[numbers].iter().map(|&number| number as f64).sum(),
+        }
     }
 
     /// Statistics over some rows, of `dim` numbers each.

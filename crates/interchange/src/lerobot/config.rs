@@ -6,7 +6,11 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
+use results::files::read_file;
 use zoo::ZooError;
+
+/// More bytes than such a file has.
+pub(super) const MOST_TEXT: u64 = 1 << 26;
 
 /// A processor pipeline: what LeRobot does before or after the network.
 #[derive(Debug, Serialize, Deserialize)]
@@ -39,8 +43,8 @@ pub(super) struct NormaliserStep {
 
 /// Reads JSON or says which file is not what it should be.
 pub(super) fn read<T: serde::de::DeserializeOwned>(path: &Path) -> Result<T, ZooError> {
-    let text = std::fs::read_to_string(path).map_err(ZooError::io("read", path))?;
-    serde_json::from_str(&text)
+    let text = read_file(path, MOST_TEXT).map_err(ZooError::io("read", path))?;
+    serde_json::from_slice(&text)
         .map_err(|e| ZooError::Malformed { path: path.to_owned(), reason: format!("not LeRobot's: {e}") })
 }
 

@@ -10,6 +10,7 @@ use models::{
 };
 use serde_json::Value;
 
+use results::files::read_file;
 use zoo::entry::{CamerasMeta, CardWords, EntryDraft, EntryId, EntryMeta, ParentMeta, reference};
 use zoo::experiment::{DataSection, Experiment, IMAGE_PREFIX, NormalisationSection, RolloutSection, TaskSection};
 use zoo::run::TrainSection;
@@ -163,9 +164,9 @@ pub fn import(folder: &Path, options: &ImportOptions, zoo: &Path) -> Result<Entr
             task: options.task.clone(),
             env_name: of_origin.and_then(|origin| origin.env_name.clone()),
             env_version: of_origin.and_then(|origin| origin.env_version.clone()),
-            env_module: of_origin.and_then(|origin| origin.env_module.clone()),
+            env_module: None,
             env_args: of_origin
-                .and_then(|origin| origin.env_args.clone())
+                .and_then(|origin| origin.env_args.clone().map(crate::without_module))
                 .or_else(|| options.fast_render.then(CamerasMeta::fast)),
             parameters: model.params().count() as u64,
             signature: preprocess.signature().clone(),
@@ -214,7 +215,7 @@ fn is_older(folder: &Path) -> bool {
 /// What `lerobot-train` left beside the checkpoint about its training: `, trained on lerobot/pusht, 100000 steps of 8, seed 1000`.
 fn trained_as(folder: &Path) -> String {
     let read = |path: &Path| {
-        let text = std::fs::read(path).ok()?;
+        let text = read_file(path, config::MOST_TEXT).ok()?;
         serde_json::from_slice::<Value>(&text).ok()
     };
     let Some(config) = read(&folder.join(TRAIN_CONFIG)) else { return String::new() };

@@ -151,6 +151,24 @@ fn an_entry_that_went_out_and_in_still_says_what_it_was_trained_on() {
     assert_eq!(trained_further.experiment, "imported from LeRobot");
 }
 
+#[test]
+fn a_module_that_an_export_names_is_left_out() {
+    let root = tempfile::tempdir().unwrap();
+    let (zoo, out) = (root.path().join("zoo"), root.path().join("exported"));
+    let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../zoo");
+    let first = Entry::open(&shipped, &zoo::entry::EntryId { name: "lift-act".to_owned(), version: 1 }).unwrap();
+    export(&first, &out).unwrap();
+    let path = out.join("actrm_provenance.json");
+    let mut provenance: serde_json::Value = serde_json::from_slice(&fs::read(&path).unwrap()).unwrap();
+    let module = serde_json::json!({"name": "somebody.elses", "sha256": "0".repeat(64)});
+    provenance["meta"]["env_args"] = serde_json::json!({"env_kwargs": {"robots": "Panda"}, "env_module": module});
+    provenance["meta"]["env_module"] = module;
+    fs::write(&path, provenance.to_string()).unwrap();
+    let entry = Entry::open(&zoo, &import(&out, &options(), &zoo).unwrap()).unwrap();
+    assert_eq!(entry.meta().env_module, None);
+    assert_eq!(entry.meta().env_args, Some(serde_json::json!({"env_kwargs": {"robots": "Panda"}})));
+}
+
 /// A copy of a fixture in `root`.
 fn copied(root: &Path, name: &str) -> PathBuf {
     let copy = root.join("checkpoint");
@@ -347,4 +365,10 @@ fn what_we_cannot_run_is_refused() {
     assert!(text.contains("QUANTILES"), "{text}");
     let text = refusal(|f| fs::remove_file(f.join("policy_preprocessor.json")).unwrap());
     assert!(text.contains("policy_preprocessor.json"), "{text}");
+    // a pipe there, which waits for ever, is refused alike
+    let text = refusal(|f| {
+        fs::remove_file(f.join("config.json")).unwrap();
+        std::os::unix::fs::symlink("/dev/null", f.join("config.json")).unwrap();
+    });
+    assert!(text.contains("config.json") && text.contains("a device or a socket"), "{text}");
 }

@@ -40,17 +40,20 @@ class ActrmPolicy(PreTrainedPolicy):
     def select_action(self, batch: dict[str, Tensor], **_: Any) -> Tensor:
         """(rows, action_dim)"""
         observation = {key: batch[key] for key in self.policy.input_features if key in batch}
-        action = torch.from_numpy(self.policy.select_action(observation))
-        if not self.begun:
-            self.begun = True
-            self.next_seed += len(action)
-        return action
+        return self._begin(torch.from_numpy(self.policy.select_action(observation)))
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, Tensor], **_: Any) -> Tensor:
         """(rows, action_horizon, action_dim)"""
         observation = {key: batch[key] for key in self.policy.input_features if key in batch}
-        return torch.from_numpy(self.policy.predict_action_chunk(observation))
+        return self._begin(torch.from_numpy(self.policy.predict_action_chunk(observation)))
+
+    def _begin(self, answer: Tensor) -> Tensor:
+        """An answer as it is; its rows' episodes have begun, and the next ones get the seeds after theirs."""
+        if not self.begun:
+            self.begun = True
+            self.next_seed += len(answer)
+        return answer
 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, Any] | None]:
         """It is not trained here."""
@@ -63,7 +66,11 @@ class ActrmPolicy(PreTrainedPolicy):
     def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
         """The entry as it is, with its hashes, and what LeRobot wants beside it."""
         name, version = self.policy.id.split("@")
-        shutil.copytree(self.policy.path, save_directory / INSIDE / name / version)
+        own, place = Path(self.policy.path), save_directory / INSIDE / name / version
+        if own.resolve() != place.resolve():
+            # what was saved there before may be another entry of that name
+            shutil.rmtree(place, ignore_errors=True)
+            shutil.copytree(own, place)
         entry, self.config.entry = self.config.entry, f"{INSIDE}/{name}/{version}"
         try:
             self.config._save_pretrained(save_directory)

@@ -144,11 +144,11 @@ def evaluate(
     image_size: int = 84,
     declared: str | None = None,
     conventions: Mapping[str, str] | None = None,
-    seed: int = 10_000,
+    seed: int | None = None,
     max_steps: int | None = None,
     n_action_steps: int | None = None,
     temporal_ensemble: float | None = None,
-    control: Literal["compiled", "robosuite"] = "compiled",
+    control: Literal["compiled", "robosuite"] | None = None,
     python: Path | None = None,
     env_module: str | None = None,
     zoo: Path | None = None,
@@ -173,8 +173,8 @@ def evaluate(
     ----------
     policy: an entry's folder (`zoo/stack-act`), its name in `zoo`, or a policy of yours.
     episodes: how many; their seeds count up from `seed`. 20 unless given.
-    workers: number of simulators at once; one per core unless given. Where there are several, each gets a copy
-        (`copy.deepcopy`) of a policy of yours that has `reset`; others are shared by threads.
+    workers: number of simulators at once; one per core that this process may use unless given. Where there are
+        several, each gets a copy (`copy.deepcopy`) of a policy of yours that has `reset`; others are shared by threads.
     progress: as in `convert`, in episodes.
     name: name of your policy's entry.
     task: another task than the entry's; the task that your policy is evaluated on.
@@ -186,15 +186,15 @@ def evaluate(
     declared: what you declare of your policy's weights, such as a hash; another one is another version of the entry.
     conventions: what your policy expects, such as `{"control_freq": "20", "gripper": "-1 opens, 1 closes"}`.
         A simulator that differs is refused. Names and values: `actrm-zoo show ENTRY --conventions`.
-    seed: seed of the first episode.
+    seed: seed of the first episode; 10000 unless given.
     max_steps: control steps after which an episode has failed; the entry's or the task's own limit unless given.
     n_action_steps: actions that are executed before the next query of the policy; the entry's unless given. With it,
         your policy is asked by `predict_action_chunk`; without, by `select_action` at every step.
     temporal_ensemble: query at every step and average all predictions, with this coefficient.
-    control: control loop inside the simulator.
+    control: control loop inside the simulator; `compiled` unless given.
     python: an interpreter with robosuite; this one where it has robosuite, else `$ACTRM_PYTHON`, `.venv` here or above,
         `python3`.
-    env_module: Python module that registers environments.
+    env_module: Python module that registers environments. An entry that was recorded with one needs it named.
     zoo: folder of the zoo that names are looked up in.
     results: folder of results; `results` in the entry's zoo unless given.
     force: evaluate even if the demonstrations were recorded in another simulator version or with these seeds.
@@ -203,7 +203,7 @@ def evaluate(
     `inference_ms` (mean of its queries) as arrays, `fingerprint` (of the initial state), `group` and `failure` as
     lists.
     """
-    workers = workers if workers is not None else os.cpu_count() or 1
+    workers = workers if workers is not None else len(os.sched_getaffinity(0))
     entry, external = None, None
     if isinstance(policy, (str, os.PathLike)):
         given = {"name": name, "inputs": inputs, "declared": declared, "conventions": conventions}

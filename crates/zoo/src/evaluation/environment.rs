@@ -22,20 +22,33 @@ pub struct Environment {
 }
 
 impl Environment {
-    /// The environment of an entry's demonstrations, unless another task or another module is named.
+    /// The environment of an entry's demonstrations, unless another task is named. `env_module` is what the user names.
     ///
     /// # Errors
-    /// As [`EntryMeta::cameras`].
+    /// As [`EntryMeta::cameras`] and [`Environment::expecting`].
     pub fn of(meta: &EntryMeta, task: Option<&str>, env_module: Option<&str>) -> Result<Self, ZooError> {
-        let recorded = || meta.env_module.as_ref().map(|module| module.name.clone());
-        let env_module = env_module.map(str::to_owned).or_else(recorded);
         // another task's environment has arguments of its own
         let other = task.filter(|task| *task != meta.task);
         let env_args = match other {
             Some(_) => None,
             None => meta.env_args.as_ref().map(serde_json::Value::to_string),
         };
-        Ok(Self { task: other.unwrap_or(&meta.task).to_owned(), env_module, env_args, cameras: meta.cameras()? })
+        let task = other.unwrap_or(&meta.task).to_owned();
+        let environment = Self { task, env_module: env_module.map(str::to_owned), env_args, cameras: meta.cameras()? };
+        let recorded = meta.env_module.as_ref().map(|module| module.name.as_str());
+        let recorded = recorded.or_else(|| meta.env_args.as_ref().and_then(rollout::recorded_module));
+        environment.expecting(&format!("entry {}", meta.id()), recorded)
+    }
+
+    /// The same where `what` was recorded with the module `recorded`.
+    ///
+    /// # Errors
+    /// [`ZooError::NotPossible`]: the user named no module.
+    pub fn expecting(self, what: &str, recorded: Option<&str>) -> Result<Self, ZooError> {
+        match rollout::check_module(recorded, self.env_module.as_deref()) {
+            Ok(()) => Ok(self),
+            Err(reason) => Err(ZooError::NotPossible { what: what.to_owned(), reason }),
+        }
     }
 
     /// A task's usual environment, seen through `cameras`.
@@ -81,6 +94,28 @@ fn with_robots(task: &str, env_args: Option<&str>, robots: &[String]) -> Value {
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
+    use crate::entry::{ModuleMeta, testing};
+
+    #[test]
+    fn a_module_is_the_users_and_never_the_files() {
+        let module = ModuleMeta { name: "theirs".to_owned(), sha256: "0".repeat(64) };
+        let env_args = serde_json::json!({"env_kwargs": {"robots": "Panda"}, "env_module": module});
+        let mut named = testing::draft("lift-act").meta;
+        named.env_module = Some(module);
+        // an entry that somebody edited
+        let mut hidden = testing::draft("lift-act").meta;
+        hidden.env_args = Some(env_args);
+        for meta in [named, hidden] {
+            for task in [None, Some("Lift"), Some("Stack")] {
+                let refused = Environment::of(&meta, task, None).unwrap_err().to_string();
+                assert!(refused.contains("entry lift-act@0") && refused.contains("\"theirs\""), "{refused}");
+            }
+            let environment = Environment::of(&meta, None, Some("mine")).unwrap();
+            let python = Python { path: "python".into(), origin: "--python".into() };
+            let spec = environment.worker(python, PathBuf::from("harness"));
+            assert_eq!(spec.env_module.as_deref(), Some("mine"));
+        }
+    }
 
     #[test]
     fn other_robots_have_their_own_controllers() {

@@ -73,7 +73,8 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         }
         _ => page(&set, episode, &chosen, &heading).into_bytes(),
     };
-    create(&args.out, &file)?;
+    cli::refuse_existing(&args.out)?;
+    write(&args.out, &file)?;
     cli::print(&format!("{}: {}\n", args.out.display(), heading))?;
     Ok(ExitCode::SUCCESS)
 }
@@ -132,14 +133,6 @@ fn page(set: &Dataset, episode: &EpisodeMeta, columns: &[&str], heading: &str) -
     }
     out.push_str("</body>\n</html>\n");
     out
-}
-
-/// Writes a new file under a temporary name first.
-fn create(path: &Path, bytes: &[u8]) -> Result<()> {
-    if path.exists() {
-        bail!("{}: exists already; choose another path or remove it first", path.display());
-    }
-    write(path, bytes)
 }
 
 /// Writes a file under a temporary name first. A file of that name is replaced.

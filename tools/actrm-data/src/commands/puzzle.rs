@@ -58,9 +58,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     if args.givens > task.cells() {
         bail!("--givens {}: {} has {} cells", args.givens, args.task, task.cells());
     }
-    if args.out.exists() {
-        bail!("{}: exists already; choose another path or remove it first", args.out.display());
-    }
+    let _parents = cli::new_file(&args.out)?;
     let mut screen = cli::Screen::new();
     screen.begin(args.task.clone(), args.count);
     let set = PuzzleSet { task, split: args.split, givens: args.givens, seed: args.seed, count: args.count };

@@ -9,7 +9,7 @@ const PROGRAM: &str = "actrm-query";
 /// Query a data set in SQL.
 ///
 /// Tables: `frames` (episode_index, frame_index, index, timestamp, task, a column for each dimension such as
-/// action_0 or object_3, and next_reward, next_done, next_success) and `episodes` (episode_index, demo, length, task,
+/// action_0 or object_3, next_reward, next_done, next_success, and columns of texts) and `episodes` (episode_index, demo, length, task,
 /// return, success, and in_<mask> for every mask). `--tables` lists the columns.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:

@@ -42,12 +42,7 @@ pub struct Args {
 }
 
 pub fn run(args: &Args) -> Result<ExitCode> {
-    if args.out.exists() && !is_page(&args.out) {
-        bail!(
-            "{}: exists already and is no page of this command; choose another path or remove it first",
-            args.out.display()
-        );
-    }
+    replaces(&args.out)?;
     let opened = Opened::open(&args.set)?;
     let mut columns = opened.columns();
     let there: Vec<String> = columns.iter().map(|column| column.name.clone()).collect();
@@ -85,10 +80,27 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     }
     screen.clear();
     let html = page.html(&head);
+    // once more: the work takes a while
+    let replaced = if replaces(&args.out)? { "; replaced an earlier page" } else { "" };
     super::plot::write(&args.out, html.as_bytes())?;
     let size = cli::bytes(html.len() as u64);
-    cli::print(&format!("{}: {} episodes, {size}\n", args.out.display(), cli::count(opened.episodes())))?;
+    let episodes = cli::count(opened.episodes());
+    cli::print(&format!("{}: {episodes} episodes, {size}{replaced}\n", args.out.display()))?;
     Ok(ExitCode::SUCCESS)
+}
+
+/// Whether a page of this command is there, which the new one replaces. Another file is refused.
+fn replaces(out: &Path) -> Result<bool> {
+    if !out.exists() {
+        return Ok(false);
+    }
+    if !is_page(out) {
+        bail!(
+            "{}: exists already and is no page of this command; choose another path or remove it first",
+            out.display()
+        );
+    }
+    Ok(true)
 }
 
 /// Whether a file is a page that this command made.
@@ -129,7 +141,7 @@ fn head(args: &Args, opened: &Opened) -> Result<Head> {
         facts.push(("masks".to_owned(), masks.join(", ")));
     }
     let mut problems = summary.problems.clone();
-    if let (false, Opened::Set(_)) = (args.quick, opened) {
+    if let (false, Opened::Set(..)) = (args.quick, opened) {
         let mut screen = cli::Screen::new();
         for check in dataset::verify(&args.set, &mut screen.advance("checking"))? {
             problems.extend(check.problem.map(|problem| format!("{}: {problem}", check.name)));

@@ -13,8 +13,7 @@ use base64::engine::general_purpose::STANDARD;
 use std::fmt::Write as _;
 
 /// What every page begins with, by which it is known again.
-pub const BEGINNING: &str =
-    "<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n<meta name=\"generator\" content=\"actrm-data view\">\n";
+pub const BEGINNING: &str = "<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n<meta name=\"generator\" content=\"actrm-data view\">\n";
 
 /// What the page says above its episodes.
 #[derive(Default)]

@@ -1,13 +1,16 @@
 //! What a page shows of a data set or of a file of demonstrations, an episode at a time.
 
 use anyhow::Result;
-use dataset::{Dataset, EpisodeMeta, NonFinite, Picture, Source};
+use dataset::{Dataset, EpisodeMeta, NonFinite, Picture, Source, Wide};
 use std::path::Path;
 
 /// Dimensions of a column of which curves are drawn unless it was asked for.
 const MOST_DIMENSIONS: usize = 64;
 /// robomimic's number for robosuite environments, whose reward is 1 where the task is solved.
 const ROBOSUITE: i64 = 1;
+
+/// The column of rewards in a data set.
+const REWARD: &str = "next.reward";
 
 /// A column that is drawn.
 pub struct Drawn {
@@ -32,21 +35,26 @@ pub struct Episode {
 
 /// What is opened.
 pub enum Opened {
-    Set(Box<Dataset>),
+    /// With its rewards, where they are numbers that float32 does not hold.
+    Set(Box<Dataset>, Option<Wide>),
     File(Box<Source>),
 }
 
 impl Opened {
     pub fn open(path: &Path) -> Result<Self> {
         Ok(match path.join("meta/info.json").exists() {
-            true => Self::Set(Box::new(Dataset::open(path)?)),
+            true => {
+                let set = Dataset::open(path)?;
+                let rewards = set.wide()?.remove(REWARD);
+                Self::Set(Box::new(set), rewards)
+            }
             false => Self::File(Box::new(Source::open_guarded(path)?.nonfinite(NonFinite::Keep))),
         })
     }
 
     pub fn episodes(&self) -> usize {
         match self {
-            Self::Set(set) => set.episodes().len(),
+            Self::Set(set, _) => set.episodes().len(),
             Self::File(source) => source.plan().demos.len(),
         }
     }
@@ -54,7 +62,7 @@ impl Opened {
     /// Frames a second, where that is stated.
     pub fn fps(&self) -> Option<f64> {
         match self {
-            Self::Set(set) => Some(set.info().fps),
+            Self::Set(set, _) => Some(set.info().fps),
             Self::File(source) => source.plan().env_args.as_ref()?.get("env_kwargs")?.get("control_freq")?.as_f64(),
         }
     }
@@ -62,7 +70,7 @@ impl Opened {
     /// Names of the cameras, of colours and of depth: columns of a data set; those of colours: datasets of a file.
     pub fn cameras(&self) -> Vec<String> {
         match self {
-            Self::Set(set) => set.cameras().chain(set.depth_names()).map(str::to_owned).collect(),
+            Self::Set(set, _) => set.cameras().chain(set.depth_names()).map(str::to_owned).collect(),
             Self::File(source) => {
                 let first = source.plan().demos.first();
                 let pictures = first.into_iter().flat_map(|demo| &demo.keys);
@@ -76,7 +84,7 @@ impl Opened {
     /// The columns that can be drawn: the actions first.
     pub fn columns(&self) -> Vec<Drawn> {
         let mut columns: Vec<Drawn> = match self {
-            Self::Set(set) => {
+            Self::Set(set, _) => {
                 let drawn = |name: &str| {
                     let dim = set.column(name).map_or(0, |column| column.dim);
                     Drawn { name: name.to_owned(), names: names_of(&set.names(name), dim) }
@@ -109,7 +117,7 @@ impl Opened {
     /// Episode `index` with the values of `columns`.
     pub fn episode(&self, index: usize, columns: &[Drawn]) -> Episode {
         match self {
-            Self::Set(set) => of_set(set, &set.episodes()[index], columns),
+            Self::Set(set, rewards) => of_set(set, rewards.as_ref(), &set.episodes()[index], columns),
             Self::File(source) => of_file(source, index, columns),
         }
     }
@@ -117,7 +125,7 @@ impl Opened {
     /// Pictures of a camera in some frames of an episode.
     pub fn pictures(&self, camera: &str, episode: usize, frames: &[usize]) -> Result<Vec<Picture>> {
         Ok(match self {
-            Self::Set(set) => pictures(set, camera, episode, frames)?,
+            Self::Set(set, _) => pictures(set, camera, episode, frames)?,
             Self::File(source) => {
                 let mut pictures = Vec::with_capacity(frames.len());
                 for &frame in frames {
@@ -166,7 +174,7 @@ fn names_of(stated: &[String], dim: usize) -> Vec<String> {
     (0..dim).map(|d| stated.get(d).cloned().unwrap_or_else(|| d.to_string())).collect()
 }
 
-fn of_set(set: &Dataset, episode: &EpisodeMeta, columns: &[Drawn]) -> Episode {
+fn of_set(set: &Dataset, rewards: Option<&Wide>, episode: &EpisodeMeta, columns: &[Drawn]) -> Episode {
     let values = |name: &str| {
         let column = set.column(name)?;
         Some(column.data[episode.from * column.dim..episode.to * column.dim].to_vec())
@@ -175,7 +183,10 @@ fn of_set(set: &Dataset, episode: &EpisodeMeta, columns: &[Drawn]) -> Episode {
         name: episode.demo.clone().unwrap_or_default(),
         length: episode.length,
         task: episode.tasks.join("; "),
-        total_reward: values("next.reward").map(|rewards| rewards.iter().map(|&r| f64::from(r)).sum()),
+        total_reward: match rewards {
+            Some(exact) => Some(exact.sum(episode.from..episode.to)),
+            None => values(REWARD).map(|rewards| rewards.iter().map(|&r| f64::from(r)).sum()),
+        },
         success: values("next.success").map(|solved| solved.contains(&1.0)),
         problems: Vec::new(),
         columns: columns.iter().map(|column| values(&column.name).unwrap_or_default()).collect(),
@@ -213,5 +224,25 @@ fn of_file(source: &Source, index: usize, columns: &[Drawn]) -> Episode {
         total_reward: rewards.map(|rewards| rewards.iter().sum()),
         problems,
         columns: columns.iter().map(values).collect(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use dataset::edit::{Destination, Renames, rename};
+    use std::ops::ControlFlow;
+
+    #[test]
+    fn a_return_is_the_sum_of_the_rewards_as_they_are_stored() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let fixture = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../crates/python/tests/fixtures/lerobot_odd");
+        let set = folder.path().join("set");
+        // of the first episode 0, 16777217 and -2
+        let renames = Renames::from([("count".to_owned(), REWARD.to_owned())]);
+        rename(&fixture, &Destination::New(set.clone()), &renames, &mut |_, _| ControlFlow::Continue(()))
+            .expect("a data set");
+        let opened = Opened::open(&set).expect("a data set");
+        assert_eq!(opened.episode(0, &[]).total_reward, Some(16_777_215.0));
     }
 }

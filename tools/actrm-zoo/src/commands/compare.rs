@@ -71,6 +71,9 @@ pub struct Args {
 }
 
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    if let (false, Some(option)) = (args.until_decided, args.run.given()) {
+        bail!("{option}: expected --until-decided beside it; otherwise no episodes are run");
+    }
     let registry = args.zoo.registry();
     let files = [&args.first, &args.second].map(|side| compared::is_file(side));
     if files.contains(&true) {

@@ -56,7 +56,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             Some(Curve { entry: entry.id().to_string(), points })
         };
         let curves: Vec<Curve> = entries.iter().filter_map(curve).collect();
-        let _parents = cli::make_parent(path)?;
+        let _parents = cli::new_file(path)?;
         write_atomic(path, curves_svg(&curves).as_bytes())?;
         cli::print(&(shown(path) + "\n"))?;
         return Ok(ExitCode::SUCCESS);

@@ -9,12 +9,14 @@ use cli::{INTERRUPTED, Screen, SimulatorArgs, Stop, limits};
 use models::actrm::{Intervention, Thinking};
 use report::Depth;
 use report::statistics::wilson_interval;
+use rollout::Control;
 use serde::Serialize;
 use zoo::ZooError;
 use zoo::evaluation::{EvaluationEnd, EvaluationOptions, Progress, evaluate};
 use zoo::results::{ResultsError, Seeds, StoredEvaluation};
 
 use crate::places::{ZooArgs, entry_names};
+use crate::simulation::{drawn, worker};
 
 const GOES_ON: &str = "stopped; run the same command again to resume";
 
@@ -44,7 +46,7 @@ pub(super) fn depths(work: &Path, entries: &KnownEntries) -> anyhow::Result<(Vec
         let Some((steps, how)) = of_folder(&name) else { continue };
         let found = audit(&folder, entries)?;
         depths.extend(found.standing.iter().map(|evaluation| Depth::new(steps, how, evaluation)));
-        let ours = |left: &LeftOut| !matches!(left.reason, ZooError::Results(ResultsError::Unfit { .. }));
+        let ours = |left: &LeftOut| !matches!(&left.reason, ZooError::Results(ResultsError::Unfit { what, .. }) if what == "entry");
         left_out.extend(found.left_out.into_iter().filter(ours));
     }
     Ok((depths, left_out))
@@ -148,14 +150,13 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         .collect::<anyhow::Result<_>>()?;
     // before anything is started: whether it can think so at all
     thoughts.iter().try_for_each(|thinking| loaded.thinking(thinking).map(drop))?;
+    let environment = drawn(&args.simulator, None, entry.meta())?;
     let stop = Stop::install(GOES_ON)?;
-    let meta = entry.meta();
-    let mut spec = args.simulator.recorded_spec(&meta.task, meta.env_args.as_ref())?;
-    spec.env_module = spec.env_module.or_else(|| meta.env_module.as_ref().map(|module| module.name.clone()));
+    let spec = worker(&environment, &args.simulator, Control::Compiled)?;
     let options = EvaluationOptions {
         seeds: Seeds { start: args.seed, count: args.episodes },
         shard: None,
-        env_module: spec.env_module.clone(),
+        env_module: environment.env_module.clone(),
         force: false,
     };
     let Some(mut pool) = args.simulator.start(spec, None, &stop)? else { return Ok(ExitCode::from(INTERRUPTED)) };

@@ -72,7 +72,7 @@ pub struct Args {
     #[arg(long, conflicts_with = "entries")]
     all_versions: bool,
     /// Use the seeds, step limit and control loop of a named protocol, such as lift-v1
-    #[arg(long, help_heading = EPISODES, value_name = "NAME", conflicts_with_all = ["episodes", "seed", "max_steps", "control", "shard"])]
+    #[arg(long, help_heading = EPISODES, value_name = "NAME", conflicts_with_all = ["episodes", "seed", "max_steps", "control", "robots", "shard"])]
     protocol: Option<String>,
     /// Seeds of the protocol: `test` to report results, `dev` to choose between policies
     #[arg(long, help_heading = EPISODES, value_name = "BLOCK", default_value = "test", requires = "protocol")]
@@ -116,7 +116,7 @@ pub struct Args {
     #[arg(long, help_heading = VIDEO, value_name = "NAME", default_value = "agentview")]
     camera: String,
     /// Width and height of the videos in pixels, an even number
-    #[arg(long, help_heading = VIDEO, value_name = "PIXELS", default_value_t = 256, value_parser = clap::value_parser!(u16).range(16..=2048))]
+    #[arg(long, help_heading = VIDEO, value_name = "PIXELS", default_value_t = 256, value_parser = limits::video_side::<2048>)]
     video_size: u16,
     /// Print the results as JSON, with the names of the leaderboard's columns
     #[arg(long, help_heading = OUTPUT)]
@@ -168,6 +168,13 @@ impl Asked<'_> {
         match self.protocol.filter(|protocol| protocol.task != task) {
             Some(protocol) => bail!("protocol {}: task: expected {}, found {task}", protocol.name, protocol.task),
             None => Ok(()),
+        }
+    }
+
+    /// Says so where an evaluation does not count as the protocol's.
+    fn note_doubt(&self, evaluation: &StoredEvaluation) {
+        if let Some(doubt) = self.protocol.and_then(|protocol| protocol.doubt(&evaluation.record)) {
+            cli::note(&format!("note: {doubt}"));
         }
     }
 }
@@ -334,7 +341,10 @@ fn evaluate_on(
             None => Ok((None, subject)),
         });
         match done.map_err(|error| of_entry(&id, error)) {
-            Ok((Some(evaluation), _)) => says.evaluation(&evaluation, true)?,
+            Ok((Some(evaluation), _)) => {
+                asked.note_doubt(&evaluation);
+                says.evaluation(&evaluation, true)?;
+            }
             Ok((None, subject)) => subjects.push(subject),
             Err(error) => failures.push(error),
         }
@@ -423,6 +433,7 @@ fn evaluate_remote(
     if let Some(ready) = remembered
         && let Some(evaluation) = finished(&subject(&ready)?, &ready, &results, &options)?
     {
+        asked.note_doubt(&evaluation);
         return says.evaluation(&evaluation, true);
     }
     let Some(mut pool) = start(&args.run, spec, stop)? else { return Ok(()) };
@@ -456,15 +467,7 @@ fn evaluate_entry(
         false => match run_missing(subject, pool, &results, options)? {
             None => true,
             Some(Evaluated { evaluation, was_there }) => {
-                if let Some(protocol) =
-                    asked.protocol.filter(|protocol| protocol.block_of(&evaluation.record).is_none())
-                {
-                    let (id, name, versions) = (&evaluation.record.entry, &protocol.name, &evaluation.record.versions);
-                    cli::note(&format!(
-                        "note: {id}: not of {name}, which fixes {:?}: found {versions:?}",
-                        protocol.versions
-                    ));
-                }
+                asked.note_doubt(&evaluation);
                 says.evaluation(&evaluation, was_there)?;
                 let lost = evaluation.episodes.iter().filter(|episode| !episode.success).map(|episode| episode.seed);
                 failed.extend(lost.take(usize::try_from(args.video_failed)?));
@@ -474,7 +477,8 @@ fn evaluate_entry(
         true => again(subject, pool, &results, options, says)?,
     };
     if !stopped && args.video > 0 && !stop.asked() {
-        let seeds: Vec<u64> = options.seeds.iter().take(usize::try_from(args.video)?).collect();
+        let mut seeds = subject.record(pool.ready(), options)?.own_seeds();
+        seeds.truncate(usize::try_from(args.video)?);
         videos((args, options), &seeds, &camera_view(args), subject, pool)?;
     }
     if !stopped && !failed.is_empty() && !stop.asked() {

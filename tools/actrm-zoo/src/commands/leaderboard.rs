@@ -49,7 +49,7 @@ pub struct Args {
     /// Folder for leaderboard.csv and report.html [default: the zoo]
     #[arg(long, short, value_name = "DIR")]
     out: Option<PathBuf>,
-    /// Also write the table to this Markdown file
+    /// Also write the table to this Markdown file; one that is there is replaced
     #[arg(long, value_name = "FILE")]
     markdown: Option<PathBuf>,
     /// Folder of the results of `actrm-zoo depth`, which are shown in a section of their own

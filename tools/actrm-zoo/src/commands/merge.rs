@@ -46,12 +46,22 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if groups.is_empty() {
         bail!("no shards in {}", shown(&results));
     }
-    for shards in groups.values() {
-        let whole = merge_shards(shards, &results)?;
-        let (won, all) = (whole.successes(), whole.episodes.len());
-        cli::print(&format!("{won} of {all} episodes succeeded ({})\n", shown(&whole.folder)))?;
+    // one that lacks a shard does not keep the others from being merged
+    let mut failures: Vec<anyhow::Error> = Vec::new();
+    for (name, shards) in &groups {
+        match merge_shards(shards, &results).map_err(anyhow::Error::from) {
+            Ok(whole) => {
+                let (won, all) = (whole.successes(), whole.episodes.len());
+                cli::print(&format!("{won} of {all} episodes succeeded ({})\n", shown(&whole.folder)))?;
+            }
+            Err(error) if name.is_empty() => return Err(error),
+            Err(error) => failures.push(error.context(name.clone())),
+        }
     }
-    Ok(ExitCode::SUCCESS)
+    for failure in &failures {
+        cli::note(&format!("error: {failure:#}"));
+    }
+    Ok(if failures.is_empty() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
 fn shard_folders(results: &Path) -> anyhow::Result<Vec<PathBuf>> {

@@ -4,9 +4,11 @@ use std::process::ExitCode;
 use analysis::depth::starts;
 use analysis::probe::{ProbeCell, ProbeRequest, ProbeResult, probe};
 use cli::{INTERRUPTED, SimulatorArgs, Stop, limits, shown};
+use rollout::Control;
 use zoo::results::Seeds;
 
 use crate::places::{ZooArgs, entry_names};
+use crate::simulation::{drawn, worker};
 
 /// Probe the latent state of a recursive policy: which object of a chain it has reached at each step
 ///
@@ -17,7 +19,7 @@ use crate::places::{ZooArgs, entry_names};
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo probe pickchain-actrm --data out/robots/pickchain.hdf5
-  actrm-zoo probe pickchain-actrm --data out/robots/pickchain.hdf5 --steps 12 --out docs/results/recursion/probe_k6.json")]
+  actrm-zoo probe pickchain-actrm --data out/robots/pickchain.hdf5 --steps 12 --out probe.json")]
 pub struct Args {
     /// Entry: `name` (its newest version) or `name@version`
     #[arg(add = entry_names())]
@@ -63,9 +65,11 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         steps: args.steps.map(usize::try_from).transpose()?.unwrap_or(longest),
         renamings: args.renamings,
     };
-    let stop = Stop::install("stopped")?;
+    let _parents = args.out.as_deref().map(cli::new_file).transpose()?;
     let meta = loaded.entry().meta();
-    let spec = args.simulator.recorded_spec(&meta.task, meta.env_args.as_ref())?;
+    let environment = drawn(&args.simulator, None, meta)?;
+    let stop = Stop::install("stopped")?;
+    let spec = worker(&environment, &args.simulator, Control::Compiled)?;
     let Some(mut pool) = args.simulator.start(spec, None, &stop)? else { return Ok(ExitCode::from(INTERRUPTED)) };
     let seeds = Seeds { start: args.seed, count: args.episodes };
     let ready = pool.ready().clone();
@@ -73,13 +77,13 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     cli::close(pool);
     let Some(fresh) = fresh else { return Ok(ExitCode::from(INTERRUPTED)) };
     let result = probe(&request, &ready, seeds, &fresh)?;
-    if let Some(path) = &args.out {
-        result.write(path)?;
-        cli::note(&shown(path));
-    }
     match args.json {
         true => cli::print_json(&result)?,
         false => cli::print(&tables(&result))?,
+    }
+    if let Some(path) = &args.out {
+        result.write(path)?;
+        cli::note(&shown(path));
     }
     Ok(ExitCode::SUCCESS)
 }

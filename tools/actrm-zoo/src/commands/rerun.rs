@@ -8,7 +8,7 @@ use recording::{CollectEnd, CollectOptions, CollectProgress, collect};
 use rollout::{Control, Skill};
 use serde_json::json;
 use zoo::entry::Entry;
-use zoo::evaluation::{Environment, Subject};
+use zoo::evaluation::{Environment, EvaluationOptions, Subject};
 use zoo::results::EvaluationRecord;
 
 use crate::places::{BlockArg, ProtocolArgs, ResultsArgs, ZooArgs, entry_names};
@@ -103,6 +103,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if let Some(rerun) = &rerun {
         // before hours of work
         rerun.options(args.episodes)?;
+        rerun.environment(args.simulator.env_module.as_deref())?;
         let stop = Stop::install(GOES_ON)?;
         if !again(args, rerun, &stop, &mut report)? {
             cli::note(GOES_ON);
@@ -197,7 +198,9 @@ fn collected(args: &Args, rerun: &Rerun, stop: &Stop) -> anyhow::Result<Collecti
     }
     let episodes = data.train_episodes + data.valid_episodes;
     std::fs::create_dir_all(rerun.work()).with_context(|| format!("cannot create {}", shown(rerun.work())))?;
-    let environment = Environment::of(meta, None, None)?;
+    // the row may have been measured with a module, and the demonstrations collected without one
+    let module = args.simulator.env_module.as_deref().filter(|_| meta.env_module.is_some());
+    let environment = Environment::of(meta, None, module)?;
     cli::note(&format!("collecting {episodes} demonstrations of {}'s expert, seed {seed}", environment.task));
     let skill = data.skill.as_deref().map_or(Ok(Skill::Good), str::parse::<Skill>).map_err(anyhow::Error::msg)?;
     let options = CollectOptions {
@@ -234,8 +237,10 @@ fn episodes(
     stop: &Stop,
     report: &mut Report,
 ) -> anyhow::Result<bool> {
-    let options = rerun.options(args.episodes)?;
-    let spec = worker(&rerun.environment()?, &args.simulator, rerun.stored().record.protocol.control)?;
+    let environment = rerun.environment(args.simulator.env_module.as_deref())?;
+    let env_module = environment.env_module.clone();
+    let options = EvaluationOptions { env_module, ..rerun.options(args.episodes)? };
+    let spec = worker(&environment, &args.simulator, rerun.stored().record.protocol.control)?;
     let Some(mut pool) = args.simulator.start(spec, None, stop)? else { return Ok(false) };
     let done = run_missing(subject, &mut pool, &rerun.results(entry), &options);
     cli::close(pool);

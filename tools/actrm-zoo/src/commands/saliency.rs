@@ -58,6 +58,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         let seen = if names.is_empty() { "no observation".to_owned() } else { names.join(", ") };
         bail!("entry {id} is not an image policy; its inputs are {seen}");
     }
+    let _parents = cli::new_file(&args.out)?;
     let loaded = entry.load()?;
     let subject = loaded.subject();
     let environment = drawn(&args.simulator, args.task.as_deref(), entry.meta())?;
@@ -75,7 +76,6 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         return Ok(ExitCode::from(INTERRUPTED));
     };
     let file = looked.strip().to_png().with_context(|| format!("{}: cannot draw it", shown(&args.out)))?;
-    let _parents = cli::make_parent(&args.out)?;
     write_atomic(&args.out, &file)?;
     match args.json {
         true => cli::print_json(&looked)?,

@@ -73,6 +73,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         ("--workers", args.simulator.workers.is_some()),
         ("--env-module", args.simulator.env_module.is_some()),
     ];
+    let files = [&args.parquet, &args.svg].into_iter().flatten();
+    let _parents: Vec<cli::Parents> = files.map(|path| cli::new_file(path)).collect::<anyhow::Result<_>>()?;
     let options = TraceOptions {
         index: args.index,
         depth: args.depth,
@@ -121,17 +123,16 @@ fn trace_policy(args: &Args, entry: &Entry) -> anyhow::Result<ExitCode> {
     let Some(traced) = traced.with_context(|| format!("entry {}", entry.id()))? else {
         return Ok(ExitCode::from(INTERRUPTED));
     };
+    match args.json {
+        true => cli::print_json(&traced)?,
+        false => cli::print(&traced.to_text())?,
+    }
     if let Some(path) = &args.parquet {
         traced.write_parquet(path)?;
     }
     if let (Some(path), Some(svg)) = (&args.svg, traced.way_svg().or_else(|| traced.attention_svg())) {
-        let _parents = cli::make_parent(path)?;
         write_atomic(path, svg.as_bytes())?;
         cli::note(&shown(path));
-    }
-    match args.json {
-        true => cli::print_json(&traced)?,
-        false => cli::print(&traced.to_text())?,
     }
     Ok(ExitCode::SUCCESS)
 }
