@@ -8,9 +8,9 @@ const PROGRAM: &str = "actrm-query";
 
 /// Query a data set in SQL.
 ///
-/// Tables: `frames` (episode_index, frame_index, index, timestamp, task, a column for each dimension such as
-/// action_0 or object_3, next_reward, next_done, next_success, and columns of texts) and `episodes` (episode_index, demo, length, task,
-/// return, success, and in_<mask> for every mask). `--tables` lists the columns.
+/// The table `frames` has episode_index, frame_index, index, timestamp, task, next_reward, next_done, next_success, a column for
+/// each dimension, such as action_0 or object_3, and columns of texts. The table `episodes` has episode_index, demo, length, task,
+/// return, success, and in_<mask> for every mask. `--tables` lists the columns.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-data query lift \"SELECT demo, length FROM episodes ORDER BY length DESC LIMIT 5\"
