@@ -156,7 +156,7 @@ pub(crate) fn evaluate<'py>(
             ("n_action_steps or temporal_ensemble", execution.is_some() && rules.execution.is_some()),
         ];
         if let Some((word, _)) = given.iter().find(|(_, given)| *given) {
-            return invalid(format!("{word}: expected as protocol {} says, found another", rules.name));
+            return invalid(format!("{word}: protocol {} fixes it; leave it out", rules.name));
         }
         (task, max_steps, control) = (Some(rules.task.clone()), Some(rules.max_steps), rules.control);
         (seeds, execution) = (rules.seeds(Block::Test), execution.or(rules.execution));

@@ -130,7 +130,7 @@ pub fn extract(
     }
     let ready = pool.ready().clone();
     same_generation(&options.raw, plan.env_version.as_deref(), &ready.simulator, ready.simulator_version())?;
-    let of_data = source.root()?.inner_attrs.remove("data").unwrap_or_default();
+    let of_data = source.data_attrs()?;
     let mut writer = RobomimicWriter::create(&options.out, &WriteOptions { gzip: options.gzip })?;
     let env_args = env_args(plan.env_args.as_ref(), &pool.ready().env_args);
     let (mut steps, mut done) = (0_u64, 0_usize);

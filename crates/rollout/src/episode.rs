@@ -186,7 +186,7 @@ impl EpisodePlan {
         let Ready { task, max_steps: longest, .. } = worker.ready();
         if self.max_steps > *longest {
             let message =
-                format!("expected a cap of at most {longest} steps, where its expert ends, found {}", self.max_steps);
+                format!("expected --max-steps of at most {longest}, where its expert ends, found {}", self.max_steps);
             return Err(RolloutError::Refused { task: task.clone(), kind: "max_steps".to_owned(), message }.into());
         }
         let Initial { fingerprint, group, .. } = worker.reset(seed)?;

@@ -187,7 +187,7 @@ impl NamedProtocol {
             VERSIONS => {
                 format!("{entry}: not of {name}, which fixes {:?}: found {:?}", self.versions, record.versions)
             }
-            rule => format!("{entry}: not of {name}, which has another {rule}"),
+            rule => format!("{entry}: not of {name}: its {rule} is not the protocol's"),
         })
     }
 }
@@ -364,7 +364,7 @@ mod tests {
         let versions = doubt(|r| drop(r.versions.insert("mujoco".into(), "3.9.0".into())));
         assert!(versions.contains("3.3.7") && versions.contains("3.9.0"), "{versions}");
         let robot = doubt(|r| r.protocol.env_args_sha256 = Some("0".repeat(64)));
-        assert_eq!(robot, "a@1: not of lift-v1, which has another robot or controller");
+        assert_eq!(robot, "a@1: not of lift-v1: its robot or controller is not the protocol's");
     }
 
     #[test]

@@ -78,7 +78,7 @@ pub fn armed() -> bool {
 
 #[derive(Debug, Clone, Serialize, Deserialize)]
 enum Request {
-    Root,
+    Root { datasets: bool },
     Demo { index: usize, keys: Vec<String> },
     Rows { index: usize, key: String, first: usize, count: usize },
 }
@@ -92,7 +92,7 @@ pub(super) trait Ask: Serialize {
 impl Ask for Request {
     fn words(&self) -> String {
         match self {
-            Self::Root => "read what belongs to no demo".to_owned(),
+            Self::Root { .. } => "read what belongs to no demo".to_owned(),
             Self::Demo { index, keys } => match keys.as_slice() {
                 [] => format!("read the attributes of demo {index}"),
                 [one] => format!("read {one} of demo {index}"),
@@ -161,7 +161,7 @@ fn serve(path: &Path) -> std::io::Result<()> {
     while let Some(text) = next_request(&mut requests)? {
         body.clear();
         let (kind, failed) = match serde_json::from_slice(&text)? {
-            Request::Root => (DEMO, local.root().map(|root| put_demo(&mut body, &root)).err()),
+            Request::Root { datasets } => (DEMO, local.root(datasets).map(|root| put_demo(&mut body, &root)).err()),
             Request::Demo { index, keys } => {
                 (DEMO, local.demo(index, &keys).map(|demo| put_demo(&mut body, &demo)).err())
             }
@@ -497,8 +497,8 @@ impl Remote {
 }
 
 impl Backend for Remote {
-    fn root(&self) -> Result<Demo, InputError> {
-        self.ask(&Request::Root, DEMO, |t| t.demo())
+    fn root(&self, datasets: bool) -> Result<Demo, InputError> {
+        self.ask(&Request::Root { datasets }, DEMO, |t| t.demo())
     }
 
     fn demo(&self, index: usize, keys: &[String]) -> Result<Demo, InputError> {

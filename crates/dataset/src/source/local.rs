@@ -13,8 +13,8 @@ use crate::tree::{Array, Attrs, Demo, Dtype};
 
 /// What a source can be asked for, in this process or in another.
 pub(super) trait Backend: Send + Sync {
-    /// Everything that belongs to no demo.
-    fn root(&self) -> Result<Demo, InputError>;
+    /// Everything that belongs to no demo; its datasets only where they are wanted.
+    fn root(&self, datasets: bool) -> Result<Demo, InputError>;
     /// Attributes and groups of a demo, and the datasets that are named.
     fn demo(&self, index: usize, keys: &[String]) -> Result<Demo, InputError>;
     /// Rows of one dataset of a demo.
@@ -196,7 +196,7 @@ fn list_files(
 }
 
 impl Backend for Local {
-    fn root(&self) -> Result<Demo, InputError> {
+    fn root(&self, datasets: bool) -> Result<Demo, InputError> {
         let mut root = Demo::default();
         for (name, text) in &self.plan.texts {
             if let Some(name) = name.strip_prefix(dialect::BESIDE) {
@@ -205,7 +205,7 @@ impl Backend for Local {
         }
         let Some(file) = self.survey.single() else {
             if self.parts.iter().any(|d| d.home.as_ref().is_some_and(|(_, path)| !path.is_empty())) {
-                self.roots(&mut root)?;
+                self.roots(&mut root, datasets)?;
             }
             return Ok(root);
         };
@@ -238,7 +238,9 @@ impl Backend for Local {
             if in_demo(path) || used.contains(path) {
                 continue;
             }
-            root.datasets.insert(path.to_owned(), file.read(path, None)?);
+            if datasets {
+                root.datasets.insert(path.to_owned(), file.read(path, None)?);
+            }
             if node.attrs > 0 {
                 root.inner_attrs.insert(path.to_owned(), file.attrs(path)?);
             }
@@ -310,7 +312,7 @@ impl Backend for Local {
 impl Local {
     /// What belongs to no demo in several files of many demos each: the attributes that the group `data` needs, and below
     /// `files/<name>` everything else of each.
-    fn roots(&self, root: &mut Demo) -> Result<(), InputError> {
+    fn roots(&self, root: &mut Demo, datasets: bool) -> Result<(), InputError> {
         let mut data = Attrs::from([("total".to_owned(), Array::from_i64(Vec::new(), &[self.plan.frames() as i64]))]);
         if let Some(env_args) = &self.plan.env_args {
             data.insert("env_args".to_owned(), Array::from_str(&env_args.to_string()));
@@ -326,7 +328,7 @@ impl Local {
                 let below = if path.is_empty() { String::new() } else { format!("/{path}") };
                 root.inner_attrs.insert(format!("files/{name}{below}"), file.attrs(path)?);
             }
-            for path in file.datasets.keys().filter(|path| outside(path)) {
+            for path in file.datasets.keys().filter(|path| datasets && outside(path)) {
                 root.datasets.insert(format!("files/{name}/{path}"), file.read(path, None)?);
             }
         }

@@ -23,7 +23,7 @@ use rustix::buffer::spare_capacity;
 use crate::error::{InputError, Result};
 use crate::lerobot::{old_version, refuse_shard};
 use crate::plan::{DemoPlan, KeyPlan, Plan};
-use crate::tree::{Array, Demo};
+use crate::tree::{Array, Attrs, Demo};
 use local::{Backend, Local};
 
 pub(crate) use dialect::list;
@@ -137,7 +137,12 @@ impl Source {
     /// Everything in the file that belongs to no demo: attributes, masks, extra datasets and groups, by path
     /// (`mask/train`; the attributes of `data` are `inner_attrs["data"]`).
     pub fn root(&self) -> Result<Demo> {
-        Ok(self.backend.root()?)
+        Ok(self.backend.root(true)?)
+    }
+
+    /// The attributes of the group of all demos.
+    pub fn data_attrs(&self) -> Result<Attrs> {
+        Ok(self.backend.root(false)?.inner_attrs.remove("data").unwrap_or_default())
     }
 
     /// Reads and checks a demo. Refuses one beyond 512 MB: read that with [`Self::read_demo_where`] and

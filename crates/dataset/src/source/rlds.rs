@@ -495,7 +495,7 @@ fn png_size(file: &[u8]) -> Option<(usize, usize)> {
 }
 
 impl Backend for Rlds {
-    fn root(&self) -> Result<Demo, InputError> {
+    fn root(&self, _datasets: bool) -> Result<Demo, InputError> {
         Ok(Demo::default())
     }
 

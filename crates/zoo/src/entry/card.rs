@@ -102,9 +102,10 @@ fn render_into(meta: &EntryMeta, words: &CardWords, card: &mut String) -> std::f
             id = meta.id()
         );
     }
+    let module = meta.env_module.as_ref().map_or_else(String::new, |module| format!(" --env-module {}", module.name));
     writeln!(
         card,
-        "\nUse: `actrm-zoo eval {id} --episodes 50`. Provenance and the hash of every file: `entry.json`; \
+        "\nUse: `actrm-zoo eval {id} --episodes 50{module}`. Provenance and the hash of every file: `entry.json`; \
          the whole experiment: `config.toml`.\n\n\
          Intended for the task above in simulation, in the observation and action spaces that it was trained in; \
          nothing is known about it elsewhere.",

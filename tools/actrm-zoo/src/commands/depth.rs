@@ -46,7 +46,7 @@ pub(super) fn depths(work: &Path, entries: &KnownEntries) -> anyhow::Result<(Vec
         let Some((steps, how)) = of_folder(&name) else { continue };
         let found = audit(&folder, entries)?;
         depths.extend(found.standing.iter().map(|evaluation| Depth::new(steps, how, evaluation)));
-        let ours = |left: &LeftOut| !matches!(&left.reason, ZooError::Results(ResultsError::Unfit { what, .. }) if what == "entry");
+        let ours = |left: &LeftOut| !matches!(&left.reason, ZooError::Results(ResultsError::Unfit { what, .. }) if what.ends_with("entry"));
         left_out.extend(found.left_out.into_iter().filter(ours));
     }
     Ok((depths, left_out))

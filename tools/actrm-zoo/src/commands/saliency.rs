@@ -21,7 +21,7 @@ use crate::simulation::{drawn, worker};
 #[derive(clap::Args)]
 #[command(after_help = "Examples:
   actrm-zoo saliency lift-act-image-s1 --out saliency.png
-  actrm-zoo saliency lift-act-image-s1 --seed 40007 --queries 4 --out saliency.png")]
+  actrm-zoo saliency lift-act-image-s1 --seed 40007 --queries 4 --out queries.png")]
 pub struct Args {
     /// Entry: `name` (its newest version) or `name@version`
     #[arg(add = entry_names())]

@@ -644,7 +644,7 @@ impl Buffer {
 }
 
 impl Backend for Buffer {
-    fn root(&self) -> Result<Demo, InputError> {
+    fn root(&self, _datasets: bool) -> Result<Demo, InputError> {
         Ok(Demo::default())
     }
 
