@@ -493,5 +493,5 @@ fn an_expert_s_episode_says_how_it_was_lost_where_it_was_within_the_cap() {
         assert_eq!((outcome.failure.as_deref(), outcome.progress), (failure, progress), "{max_steps} steps");
     }
     let error = run(31).unwrap_err().to_string();
-    assert!(error.contains("at most 30 steps") && error.contains("found 31"), "{error}");
+    assert!(error.contains("--max-steps of at most 30") && error.contains("found 31"), "{error}");
 }
