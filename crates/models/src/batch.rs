@@ -13,6 +13,8 @@ pub struct Batch {
     pub actions: Tensor,
     /// (b, H): 1 where the step lies beyond the end of its episode, else 0
     pub is_pad: Tensor,
+    /// `is_pad` row by row on the CPU, if it came from there: reading it does not wait for a device
+    pub padding: Option<Vec<f32>>,
     /// What the demonstrations took; `None` where nobody asked.
     pub taken: Option<Taken>,
     /// (b, cells): 1 where a demonstration comes by a cell of a grid now or later, else 0; `None` where nobody asked.
@@ -82,7 +84,8 @@ impl Batch {
         Ok(Self {
             observation: tensors,
             actions: Tensor::from_vec(actions, (n, action_horizon, signature.action_dim), device)?,
-            is_pad: Tensor::from_vec(pad, (n, action_horizon), device)?,
+            is_pad: Tensor::from_slice(&pad, (n, action_horizon), device)?,
+            padding: Some(pad),
             taken: None,
             visited: None,
             auxiliary: None,
@@ -139,10 +142,12 @@ impl Batch {
             .map(|i| {
                 let (from, to) = (rows * i / n, rows * (i + 1) / n);
                 let cut = |t: &Tensor| t.narrow(0, from, to - from)?.contiguous();
+                let horizon = self.is_pad.dim(1)?;
                 Ok(Self {
                     observation: self.observation.try_map(|_, tensor| cut(tensor))?,
                     actions: cut(&self.actions)?,
                     is_pad: cut(&self.is_pad)?,
+                    padding: self.padding.as_ref().map(|pad| pad[from * horizon..to * horizon].to_vec()),
                     taken: self
                         .taken
                         .as_ref()

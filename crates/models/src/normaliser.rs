@@ -64,6 +64,8 @@ pub struct Guarded {
 
 impl Normaliser {
     pub(crate) const EPS: f32 = 1e-8;
+    /// Spread that a constant dimension of the actions is given: an error of the network hardly moves what is executed.
+    const CONSTANT_ACTION: f32 = 0.01;
 
     /// Takes the statistics that `modes` need from `tensors`, named `<feature>.mean`, `.std`, `.min`, `.max`.
     ///
@@ -106,9 +108,10 @@ impl Normaliser {
     }
 
     /// Gives every dimension whose spread is below `1e-6 * max(1, |centre|)` a spread of 1, so that it maps to 0 and a
-    /// value never seen in the data is not blown up by 1/1e-8. The changed statistics are what is stored: LeRobot's own
-    /// formula then gives the same numbers. Returns what was changed.
-    pub fn guard_constant(&mut self) -> Vec<Guarded> {
+    /// value never seen in the data is not blown up by 1/1e-8. A dimension of the actions gets 0.01, so that a policy does not execute
+    /// its own error there, unless `actions_vary`: training shows actions that are not in the data (mirrored, turned). The changed
+    /// statistics are what is stored: LeRobot's own formula then gives the same numbers. Returns what was changed.
+    pub fn guard_constant(&mut self, actions_vary: bool) -> Vec<Guarded> {
         let mut changed = Vec::new();
         for (name, feature) in &mut self.features {
             for (dim, (a, b)) in feature.a.iter_mut().zip(&mut feature.b).enumerate() {
@@ -117,10 +120,13 @@ impl Normaliser {
                     continue;
                 }
                 changed.push(Guarded { feature: name.clone(), dim, spread });
+                let room = if name == ACTION && !actions_vary { Self::CONSTANT_ACTION } else { 1.0 };
+                // beside a large value a smaller spread would be rounded away
+                let room = room.max(4e-6 * a.abs());
                 if feature.mode == NormMode::MinMax {
-                    (*a, *b) = (*a - 0.5, *a + 0.5);
+                    (*a, *b) = (*a - room / 2.0, *a + room / 2.0);
                 } else {
-                    *b = 1.0;
+                    *b = room;
                 }
             }
         }
@@ -242,16 +248,36 @@ mod tests {
     #[test]
     fn constant_dims_are_guarded_and_reported() {
         for mode in [NormMode::MeanStd, NormMode::MinMax] {
-            let (a, b): (&[f32], &[f32]) =
-                if mode == NormMode::MinMax { (&[0.0, 0.04], &[2.0, 0.04]) } else { (&[1.0, 0.04], &[1.0, 0.0]) };
-            let mut normaliser = normaliser(mode, a, b);
-            let changed = normaliser.guard_constant();
-            assert_eq!(changed.len(), 1);
-            assert_eq!((changed[0].feature.as_str(), changed[0].dim), (ACTION, 1));
-            let mut values = [1.0, 0.05];
-            normaliser.normalise(ACTION, &mut values).unwrap();
-            assert!(values[1].abs() < 0.1, "{values:?}");
-            assert!(normaliser.guard_constant().is_empty());
+            let (a, b): (&[f32], &[f32]) = if mode == NormMode::MinMax {
+                (&[0.0, 0.04, 2e7], &[2.0, 0.04, 2e7])
+            } else {
+                (&[1.0, 0.04, 2e7], &[1.0, 0.0, 0.0])
+            };
+            for feature in [STATE, ACTION] {
+                let names = mode.statistics();
+                let tensor = |values: &[f32]| Tensor::from_slice(values, values.len(), &Device::Cpu).unwrap();
+                let tensors =
+                    names.iter().zip([a, b]).map(|(name, values)| (format!("{feature}.{name}"), tensor(values)));
+                let of = || {
+                    let modes = BTreeMap::from([(feature.to_string(), mode)]);
+                    Normaliser::new(&modes, &tensors.clone().collect()).unwrap()
+                };
+                let mut varied = of();
+                let changed = varied.guard_constant(true);
+                let dims: Vec<_> = changed.iter().map(|changed| (changed.feature.as_str(), changed.dim)).collect();
+                assert_eq!(dims, [(feature, 1), (feature, 2)]);
+                // a value that was never seen is not blown up
+                let mut values = [1.0, 0.05, 2e7 + 4.0];
+                varied.normalise(feature, &mut values).unwrap();
+                assert!(values[1].abs() < 0.1 && values[2].abs() < 1.0, "{values:?}");
+                assert!(varied.guard_constant(true).is_empty());
+                // what is executed stays near the constant, whatever the network says
+                let mut fixed = of();
+                fixed.guard_constant(false);
+                let mut values = [0.5, 0.5, 0.0];
+                fixed.unnormalise(feature, &mut values).unwrap();
+                assert_eq!((values[1] - 0.04).abs() < 0.01, feature == ACTION, "{values:?}");
+            }
         }
     }
 

@@ -140,6 +140,33 @@ impl PolicyConfig {
 }
 
 impl PolicyConfig {
+    /// Checks that a model can be built for data with so many observation steps, and with images if there are any, before the
+    /// data is opened.
+    ///
+    /// # Errors
+    /// What the model cannot read.
+    pub fn check_data(&self, n_obs_steps: usize, images: bool) -> Result<()> {
+        let refuse = |field: &'static str, found: String, expected: String| {
+            Err(ModelError::Config { model: self.policy_type(), field, found, expected })
+        };
+        match self {
+            Self::Act(_) | Self::Actrm(_) if images && n_obs_steps != 1 => {
+                refuse("data.n_obs_steps", n_obs_steps.to_string(), "1 with data.cameras".to_string())
+            }
+            Self::BcRnn(bc_rnn::Config { action_horizon, .. }) if *action_horizon != n_obs_steps => {
+                refuse("action_horizon", action_horizon.to_string(), format!("data.n_obs_steps, {n_obs_steps}"))
+            }
+            Self::Diffusion(diffusion::Config { transformer: Some(_), .. })
+            | Self::Flow(flow::Config { transformer: Some(_), .. })
+            | Self::Mip(mip::Config { transformer: Some(_), .. })
+                if images =>
+            {
+                refuse("data.cameras", "given".to_string(), "none with a transformer, which sees no images".to_string())
+            }
+            _ => Ok(()),
+        }
+    }
+
     /// The configuration of a policy that thinks step by step; `None` of the others.
     pub fn reasoner(&self) -> Option<&actrm::Config> {
         match self {

@@ -24,7 +24,8 @@ mod tests {
             all
         };
         let (vae, plain_long) = (long(serde_json::json!({})), long(serde_json::json!({"use_vae": false})));
-        let over = ["memory", "tokens"].map(|over| long(serde_json::json!({"reasoning": {"over": over}})));
+        let over = [("memory", 900), ("memory", 20), ("tokens", 200)]
+            .map(|(over, hidden)| long(serde_json::json!({"reasoning": {"over": over, "dim_feedforward": hidden}})));
         let untied = long(serde_json::json!({"use_vae": false, "reasoning": {"untied": true}}));
         let layers = serde_json::json!({"hidden": [1024, 1024], "action_horizon": 16});
         let plain = serde_json::json!({});

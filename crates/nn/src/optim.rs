@@ -54,6 +54,8 @@ pub struct Optimiser {
     threads: usize,
     /// the parameters one after the other, and their version, where operations are candle's
     values: Option<(Tensor, u64)>,
+    /// the parameters' rates where operations are candle's, once a step has asked for them; `None` inside: all are 1
+    rates: Option<Option<Tensor>>,
 }
 
 /// One step's constants.
@@ -190,7 +192,7 @@ impl Optimiser {
     /// If the tensor library fails.
     pub fn new(config: OptimiserConfig, layout: Arc<ParamLayout>) -> Result<Self> {
         let moments = [PerParameter::zeros(&layout)?, PerParameter::zeros(&layout)?];
-        Ok(Self { config, layout, moments, step: 0, threads: rayon::current_num_threads(), values: None })
+        Ok(Self { config, layout, moments, step: 0, threads: rayon::current_num_threads(), values: None, rates: None })
     }
 
     /// The parameters one after the other, (n), where operations are candle's.
@@ -214,7 +216,10 @@ impl Optimiser {
             Number::Here(scale) => (grads * *scale)?,
             Number::There(scale) => grads.broadcast_mul(scale)?,
         };
-        let rates = self.rates(params)?;
+        if self.rates.is_none() {
+            self.rates = Some(self.rates_of(params)?);
+        }
+        let rates = self.rates.clone().flatten();
         let values = self.values(params)?;
         let [PerParameter::Tensor(first), PerParameter::Tensor(second)] = &mut self.moments else {
             unreachable!("gradients and moments have the same layout")
@@ -229,7 +234,7 @@ impl Optimiser {
     }
 
     /// The parameters' rates relative to the learning rate, (n), where they are not all 1.
-    fn rates(&self, params: &Params) -> Result<Option<Tensor>> {
+    fn rates_of(&self, params: &Params) -> Result<Option<Tensor>> {
         if params.iter().all(|(name, _)| params.rate(name) == 1.0) {
             return Ok(None);
         }

@@ -182,21 +182,6 @@ impl ImageEncoder {
         params.load(&all)
     }
 
-    /// Tokens of each camera.
-    pub fn tokens(&self) -> Vec<usize> {
-        match &self.head {
-            Head::Map { .. } => self
-                .sizes
-                .iter()
-                .map(|&size| {
-                    let (h, w) = self.backbone.shape().map_size(size);
-                    h * w
-                })
-                .collect(),
-            Head::Keypoints { .. } => vec![1; self.sizes.len()],
-        }
-    }
-
     /// Positions of all tokens: (T, D). Fixed for map tokens, learned for keypoints.
     ///
     /// # Errors

@@ -51,6 +51,7 @@ impl Fixture {
             ),
             actions: self.get("action"),
             is_pad: self.get("pad"),
+            padding: None,
             total_rows: self.get("state").dim(0).unwrap(),
             total_valid_steps: pad.iter().filter(|&&p| p == 0.0).count(),
             taken: None,

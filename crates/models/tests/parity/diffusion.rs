@@ -45,6 +45,7 @@ impl Fixture {
             observation: Features::low_dimensional(seen("state"), Some(seen("env"))),
             actions: self.get("action"),
             is_pad: self.get("pad"),
+            padding: None,
             total_rows: self.get("state").dim(0).unwrap(),
             total_valid_steps: pad.iter().filter(|&&p| p == 0.0).count(),
             seed: 0,

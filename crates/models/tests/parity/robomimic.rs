@@ -78,6 +78,7 @@ impl Fixture {
         Batch {
             observation: Features::low_dimensional(self.get("state"), Some(self.get("env"))),
             is_pad: Tensor::zeros((rows, horizon), DType::F32, &Device::Cpu).unwrap(),
+            padding: None,
             actions,
             total_rows: rows,
             total_valid_steps: rows * horizon,

@@ -100,6 +100,7 @@ impl Fixture {
             observation: self.observation(),
             actions: self.io["action"].clone(),
             is_pad: self.io["pad"].clone(),
+            padding: None,
             total_rows: self.io["state"].dim(0).unwrap(),
             total_valid_steps: pad.iter().filter(|&&p| p == 0.0).count(),
             seed: 0,

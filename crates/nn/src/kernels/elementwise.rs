@@ -61,7 +61,6 @@ pub fn activate(x: &mut [f32], activation: Activation, mask: Option<DropoutMask>
     match activation {
         Activation::Relu => x.iter_mut().for_each(|x| *x = relu(*x)),
         Activation::Gelu => x.iter_mut().for_each(|x| *x *= normal_cdf(*x).0),
-        Activation::Glu => unreachable!("refused by the configuration"),
     }
     drop_scale(x, mask, first);
 }
@@ -90,7 +89,6 @@ pub fn activate_backward(
                 *g *= share + x * density * 0.398_942_3;
             }
         }
-        Activation::Glu => unreachable!("refused by the configuration"),
     }
 }
 

@@ -17,22 +17,14 @@ pub enum Activation {
     Relu,
     /// x Φ(x), exact
     Gelu,
-    /// first half times the sigmoid of the second half
-    Glu,
 }
 
 impl Activation {
-    /// x: (…, n) -> (…, n), or (…, n/2) for `Glu`
+    /// x: (…, n) -> (…, n)
     pub fn forward(self, x: &Tensor) -> Result<Tensor> {
         match self {
             Self::Relu => composed::relu(x),
             Self::Gelu => Ok(x.gelu_erf()?),
-            Self::Glu => {
-                let last = x.rank() - 1;
-                let half = x.dim(last)? / 2;
-                let (a, b) = (x.narrow(last, 0, half)?, x.narrow(last, half, half)?);
-                Ok((a * candle_nn::ops::sigmoid(&b)?)?)
-            }
         }
     }
 }

@@ -124,9 +124,9 @@ impl Mixture {
     /// # Errors
     /// If the tensor library fails.
     pub fn likeliest(&self) -> Result<Tensor> {
-        let rows = self.logits.to_vec2::<f32>()?;
-        let best = |row: &Vec<f32>| (0..row.len()).fold(0, |best, i| if row[i] > row[best] { i } else { best });
-        self.of_modes(&rows.iter().map(best).collect::<Vec<_>>())
+        let (n, _, width) = self.means.dims3()?;
+        let best = self.logits.argmax(1)?.reshape((n, 1, 1))?.broadcast_as((n, 1, width))?.contiguous()?;
+        Ok(self.means.contiguous()?.gather(&best, 1)?.squeeze(1)?)
     }
 
     /// Actions drawn as robomimic does at test time: a Gaussian by its weight, then its mean and very little noise. -> (n, A)

@@ -17,7 +17,7 @@ pub fn add(cx: &mut Context<'_>, a: &Value, b: &Value) -> Result<Value> {
     super::residual(cx, a, b, (0.0, all), None)
 }
 
-/// An activation, number by number; not `Glu`.
+/// An activation, number by number.
 ///
 /// # Errors
 /// If the tensor library fails.

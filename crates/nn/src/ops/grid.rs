@@ -59,7 +59,7 @@ pub fn grid_convolution(
         let padded = x.tensor.reshape((b, rows, columns, dim))?.pad_with_zeros(1, 1, 1)?.pad_with_zeros(2, 1, 1)?;
         let tap = |tap: usize| padded.narrow(1, tap / 3, rows)?.narrow(2, tap % 3, columns);
         let patches = Tensor::cat(&(0..NEIGHBOURS).map(tap).collect::<candle_core::Result<Vec<_>>>()?, 3)?;
-        return Ok(Value::constant(layer.forward(&patches.reshape((b, cells, width))?)?));
+        return Ok(Value::constant(layer.forward_in(&patches.reshape((b, cells, width))?, cx.precision())?));
     }
     let Some(bias) = &layer.bias else {
         let (found, expected) = ("without a bias".to_string(), "with one".to_string());

@@ -236,10 +236,10 @@ fn lstm_composed(
     let zeros = Tensor::zeros((sizes.rows, hidden), DType::F32, cx.device())?;
     let [mut h, mut c] = [0, 1].map(|at| before.map_or_else(|| zeros.clone(), |before| before[at].clone()));
     // what comes from below does not wait for the steps before
-    let from_below = input.forward(&x.tensor)?;
+    let from_below = input.forward_in(&x.tensor, cx.precision())?;
     let mut outputs = Vec::with_capacity(sizes.steps);
     for step in 0..sizes.steps {
-        let gates = (from_below.get(step)? + recurrent.forward(&h)?)?;
+        let gates = (from_below.get(step)? + recurrent.forward_in(&h, cx.precision())?)?;
         let part = |gate: usize| gates.narrow(1, gate * hidden, hidden);
         let kept = sigmoid_composed(&part(1)?)?.mul(&c)?;
         c = (kept + sigmoid_composed(&part(0)?)?.mul(&part(2)?.tanh()?)?)?;
@@ -346,10 +346,10 @@ fn gru_composed(
         Some(before) => before[0].clone(),
         None => Tensor::zeros((sizes.rows, hidden), DType::F32, cx.device())?,
     };
-    let from_below = input.forward(&x.tensor)?;
+    let from_below = input.forward_in(&x.tensor, cx.precision())?;
     let mut outputs = Vec::with_capacity(sizes.steps);
     for step in 0..sizes.steps {
-        let (below, brought) = (from_below.get(step)?, recurrent.forward(&h)?);
+        let (below, brought) = (from_below.get(step)?, recurrent.forward_in(&h, cx.precision())?);
         let part = |x: &Tensor, gate: usize| x.narrow(1, gate * hidden, hidden);
         let reset = sigmoid_composed(&(part(&below, 0)? + part(&brought, 0)?)?)?;
         let keep = sigmoid_composed(&(part(&below, 1)? + part(&brought, 1)?)?)?;

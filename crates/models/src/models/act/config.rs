@@ -124,13 +124,6 @@ impl Config {
         if !self.kl_weight.is_finite() || self.kl_weight < 0.0 {
             return refuse("kl_weight", self.kl_weight.to_string(), "a number from 0");
         }
-        if self.feedforward_activation == Activation::Glu {
-            return refuse(
-                "feedforward_activation",
-                "glu".to_string(),
-                "relu or gelu (glu halves the width that linear2 expects)",
-            );
-        }
         self.pointer.as_ref().map_or(Ok(()), |pointer| pointer.validate("act"))?;
         self.auxiliary.as_ref().map_or(Ok(()), |auxiliary| auxiliary.validate("act"))?;
         self.vision.as_ref().map_or(Ok(()), VisionConfig::validate)

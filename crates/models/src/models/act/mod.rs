@@ -22,8 +22,8 @@
 //! Shapes: b rows of a batch, C actions of a chunk (`action_horizon`), A dimensions of an action, L width of the latent, M tokens
 //! of the encoder, D width of a token (`dim_model`).
 //!
-//! Deviations: without entities, `pointer` and `auxiliary` none in the maths. `feedforward_activation = "glu"` is refused: LeRobot accepts it in its configuration,
-//! but its layer then cannot run (`glu` halves the width that `linear2` expects).
+//! Deviations: without entities, `pointer` and `auxiliary` none in the maths. There is no `feedforward_activation = "glu"`: LeRobot
+//! accepts it in its configuration, but its layer then cannot run (`glu` halves the width that `linear2` expects).
 //!
 //! Exact savings over LeRobot: of the VAE encoder's last layer only the first token is computed, because nothing else is read;
 //! the first decoder layer's queries, keys and values are computed once for the whole batch, because its input is zero for

@@ -55,7 +55,7 @@ pub struct ReasoningConfig {
     pub tokens: usize,
     /// layers of the shared block
     pub n_layers: usize,
-    /// hidden width of the shared block's feed-forward part; absent: half of `dim_feedforward`
+    /// hidden width of the shared block's feed-forward part; absent: half of `dim_feedforward`, with `over = "memory"` all of it
     pub dim_feedforward: Option<usize>,
     /// rounds per supervision step; the last one has gradients (`over = "tokens"`: 1)
     pub h_cycles: usize,
@@ -268,7 +268,8 @@ impl Config {
     /// How large the model will be.
     pub fn size(&self) -> Size {
         let block = Shape { hidden: self.block_feedforward(), ..self.shape() };
-        let tokens = if self.reasoning.over == Over::Memory { self.reasoning.tokens } else { self.action_horizon };
+        // over the memory as many as there are inputs, which are not known here: two at least
+        let tokens = if self.reasoning.over == Over::Memory { 2 } else { self.action_horizon };
         let block = block.size(1, tokens) * self.reasoning.n_layers;
         // weights are shared by all steps unless untied, the last round of each keeps its activations
         let weights = block.weights * self.reasoning.blocks() as f64;
@@ -284,7 +285,11 @@ impl Config {
 
     /// Hidden width of the shared block's dense part.
     pub fn block_feedforward(&self) -> usize {
-        self.reasoning.dim_feedforward.unwrap_or(self.dim_feedforward.div_ceil(2))
+        let usual = match self.reasoning.over {
+            Over::Memory => self.dim_feedforward,
+            Over::Actions | Over::Tokens => self.dim_feedforward.div_ceil(2),
+        };
+        self.reasoning.dim_feedforward.unwrap_or(usual)
     }
 
     /// Checks that a model with this configuration can exist.

@@ -520,7 +520,8 @@ impl PolicyModel for Actrm {
         if r.over == Over::Memory {
             let updates = (r.h_cycles * (r.l_cycles + 1) * r.n_layers) as f64;
             let decoder = flops::decoder_layer(config.shape(), horizon, memory) * config.n_decoder_layers as f64;
-            let step = flops::encoder_layer(config.shape(), memory) * updates + decoder;
+            let block = Shape { hidden: config.block_feedforward(), ..config.shape() };
+            let step = flops::encoder_layer(block, memory) * updates + decoder;
             let head = flops::linear(horizon, dim, self.signature.action_dim);
             return Some(flops::tokens(layout, config.latent_dim, dim) + (step + head) * r.max_steps() as f64);
         }

@@ -23,7 +23,7 @@ fn fixed_values(dim: usize) -> [Vec<f32>; 2] {
 impl OverMemory {
     pub(super) fn new(p: &mut Params, config: &Config, shape: Shape, rng: &mut Rng) -> Result<Self> {
         // no dropout inside the recursion
-        let quiet = Shape { dropout: 0.0, ..shape };
+        let quiet = Shape { dropout: 0.0, hidden: config.block_feedforward(), ..shape };
         Ok(Self {
             block: Encoder::new(p, "reasoning", config.reasoning.n_layers, quiet, LayerInit::Xavier, rng)?,
             z_init: fixed_values(config.dim_model),

@@ -30,6 +30,7 @@ use crate::preprocess::Preprocess;
 use candle_core::Tensor;
 use nn::ops::{mixture_likelihood, select_tokens};
 use nn::{Backend, Cache, Context, Loss, ModelError, Params, Result, Rng, Value};
+use std::borrow::Cow;
 use std::sync::Arc;
 
 /// The kinds of features that it reads.
@@ -136,10 +137,15 @@ fn beginnings(is_pad: &[f32], step: usize) -> (usize, f32) {
 }
 
 /// For every step of every row, step by step, the one that takes its place once the padding that a row begins with is moved to its
-/// end, counted row by row, and 1 if it is real, else 0. is_pad: (b, T)
-fn real_first(is_pad: &Tensor) -> Result<(Vec<usize>, Vec<f32>)> {
-    let (pads, steps) = (is_pad.to_vec2::<f32>()?, is_pad.dim(1)?);
-    let each = (0..steps).flat_map(|step| pads.iter().enumerate().map(move |(row, pad)| (row, beginnings(pad, step))));
+/// end, counted row by row, and 1 if it is real, else 0.
+fn real_first(batch: &Batch) -> Result<(Vec<usize>, Vec<f32>)> {
+    let pads = match &batch.padding {
+        Some(pads) => Cow::Borrowed(pads),
+        None => Cow::Owned(batch.is_pad.flatten_all()?.to_vec1::<f32>()?),
+    };
+    let steps = batch.is_pad.dim(1)?;
+    let rows = || pads.chunks_exact(steps).enumerate();
+    let each = (0..steps).flat_map(|step| rows().map(move |(row, pad)| (row, beginnings(pad, step))));
     Ok(each.map(|(row, (at, real))| (row * steps + at, real)).unzip())
 }
 
@@ -159,7 +165,7 @@ impl PolicyModel for BcRnn {
     fn forward_loss(&self, cx: &mut Context<'_>, batch: &Batch) -> Result<Loss> {
         check_batch("bc_rnn", &self.signature, self.config.action_horizon, batch)?;
         let observation = self.steps.prepare(&batch.observation, Some(cx.rng()?))?;
-        let (from, real) = real_first(&batch.is_pad)?;
+        let (from, real) = real_first(batch)?;
         let mixtures = self.in_order(cx, batch.rows(), &observation, &from)?;
         let count = from.len();
         let from = from.into_iter().map(|at| at as u32).collect::<Vec<_>>();

@@ -29,7 +29,8 @@ fn padded_before(signature: &Signature, rows: usize) -> Batch {
     let mut batch = batch(signature, 3, rows, 3);
     let pad: Vec<f32> = (0..rows * 3).map(|i| if i % 3 < (i / 3) % 3 { 1.0 } else { 0.0 }).collect();
     batch.total_valid_steps = pad.iter().filter(|&&p| p == 0.0).count();
-    batch.is_pad = Tensor::from_vec(pad, (rows, 3), &Device::Cpu).unwrap();
+    batch.is_pad = Tensor::from_slice(&pad, (rows, 3), &Device::Cpu).unwrap();
+    batch.padding = Some(pad);
     batch
 }
 
