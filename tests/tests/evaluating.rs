@@ -120,7 +120,7 @@ fn a_finished_evaluation_or_part_of_it_runs_again_to_the_same_outcomes() {
     }
     // results of another entry of that name
     fs::write(&record, text.replace("\"demos\": 45", "\"demos\": 44")).expect("writable");
-    refused(&mut eval(&entries, "2", &["--again"]), &["evaluation.json differs", "44", "45"]);
+    refused(&mut eval(&entries, "2", &["--again"]), &["evaluation.json: training differs", "44", "45"]);
 }
 
 #[test]

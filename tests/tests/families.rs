@@ -19,9 +19,13 @@ fn json(command: &mut Command) -> Value {
 
 /// Trains two steps with each of the seeds.
 fn train(folder: &Path, seeds: &str, more: &[&str]) -> Command {
+    train_into(&folder.join("zoo"), folder, seeds, more)
+}
+
+fn train_into(entries: &Path, folder: &Path, seeds: &str, more: &[&str]) -> Command {
     let mut command =
         zoo(["train", "act_lift", "train.steps=2", "train.batch_size=4", "policy.dim_model=32", "--seeds", seeds]);
-    command.args(["--data", text(&trained().join("lift")), "--zoo", text(&folder.join("zoo"))]);
+    command.args(["--data", text(&trained().join("lift")), "--zoo", text(entries)]);
     command.args(["--runs", text(&folder.join("runs"))]).args(more);
     command
 }
@@ -39,6 +43,15 @@ fn several_seeds_make_a_family_that_is_one_row() {
     // other settings are another family, with runs of its own
     let other = said(&mut train(folder, "1", &["train.lr=0.002"]));
     assert!(other.contains("lift-act-s1@2 is in"), "{other}");
+    // an entry of the same name in another zoo is another training's
+    let elsewhere = folder.join("elsewhere");
+    fs::create_dir_all(elsewhere.join("lift-act-s1")).expect("a folder");
+    for name in listing(&entries.join("lift-act-s1/2")) {
+        let there = elsewhere.join("lift-act-s1/1");
+        fs::create_dir_all(&there).expect("a folder");
+        fs::copy(entries.join("lift-act-s1/2").join(&name), there.join(&name)).expect("copied");
+    }
+    refused(&mut train_into(&elsewhere, folder, "1", &[]), &["seed 1", "not in", "remove that folder"]);
     refused(&mut train(folder, "1..2", &["train.seed=4"]), &["--seeds", "train.seed=4"]);
     refused(&mut train(folder, "2..1", &[]), &["2..1"]);
     assert_eq!(json(&mut zoo(["list", "--json", "--zoo", text(&entries)])).as_array().map(Vec::len), Some(4));
@@ -88,6 +101,8 @@ fn entries_are_compared_seed_by_seed() {
     let value = json(&mut compare(&["--until-decided", "--most", "24", "--max-steps", "4", "--json"]));
     assert_eq!((&value["seeds"], &value["flips"]["decided_after"]), (&24.into(), &Value::Null), "{value}");
     refused(&mut zoo(["compare", "lift-act@1", "lift-act@1", "--until-decided", "--zoo", text(&entries)]), &["twice"]);
+    assert_eq!(json(&mut compare(&["--task", "Lift", "--json"])).as_array().map(Vec::len), Some(1));
+    refused(&mut compare(&["--task", "Door"]), &["lift-act@1: no evaluations of Door in"]);
     refused(&mut compare(&["--max-steps", "4"]), &["--max-steps: expected --until-decided"]);
     refused(&mut zoo(["compare", "lift-act", "door", "--zoo", text(&entries)]), &["unknown entry `door`"]);
 }
@@ -193,8 +208,10 @@ fn aliases_point_and_what_something_stands_on_stays() {
     for name in listing(&entries.join("results")).into_iter().filter(|name| name.starts_with("lift-act@1_")) {
         fs::remove_dir_all(entries.join("results").join(name)).expect("removable");
     }
+    refused(&mut command("alias", &["lift-act", "bst", "--remove"]), &["no alias `bst`", "best = 1"]);
     succeeds(&mut command("alias", &["lift-act", "best", "--remove"]));
-    succeeds(&mut command("remove", &["lift-act@1"]));
+    // twice by mistake is once
+    succeeds(&mut command("remove", &["lift-act@1", "lift-act@1"]));
     refused(&mut command("show", &["lift-act"]), &["unknown entry `lift-act`"]);
 }
 

@@ -81,10 +81,11 @@ pub(crate) fn speaking(rows: &[LeaderboardRow]) -> BTreeMap<String, BTreeMap<Str
     table
 }
 
-/// Every kind of policy that has ranked rows in at least two tasks, by name; in each task its row of most trainings under
-/// the protocol with most episodes. Policies of other sets of tasks cannot be compared by these numbers.
+/// Every kind of policy that has ranked rows in at least two tasks, in each task its row of most trainings under the protocol with
+/// most episodes. Policies of other sets of tasks cannot be compared by these numbers: those of one set stand together, by name, the
+/// largest set first.
 pub fn across_tasks(rows: &[LeaderboardRow]) -> Vec<AcrossTasks> {
-    speaking(rows)
+    let mut all: Vec<AcrossTasks> = speaking(rows)
         .into_iter()
         .map(|(policy, mut of)| {
             of.retain(|_, row| row.rank.is_some());
@@ -104,7 +105,12 @@ pub fn across_tasks(rows: &[LeaderboardRow]) -> Vec<AcrossTasks> {
                 interval: several.then_some((low, high)),
             })
         })
-        .collect()
+        .collect();
+    all.sort_by(|a, b| {
+        let tasks = a.tasks.keys().cmp(b.tasks.keys());
+        b.tasks.len().cmp(&a.tasks.len()).then(tasks).then_with(|| a.policy.cmp(&b.policy))
+    });
+    all
 }
 
 #[cfg(test)]

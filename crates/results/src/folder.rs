@@ -296,12 +296,8 @@ impl ResultsFolder {
             // the folder's name pins what decides outcomes; the rest is the entry's story, which may
             // not change for one entry hash either
             if !found.is_same(record) {
-                return Err(ResultsError::Differ {
-                    folder,
-                    what: RECORD.to_owned(),
-                    expected: json(&found),
-                    found: json(record),
-                });
+                let (key, expected, found) = found.difference(record).unwrap_or_default();
+                return Err(ResultsError::Differ { folder, what: format!("{RECORD}: {key}"), expected, found });
             }
             own = found;
         } else {
@@ -718,6 +714,6 @@ mod tests {
         drop(ResultsFolder::open(dir.path(), &record).unwrap());
         record.training.demos = 51;
         let error = ResultsFolder::open(dir.path(), &record).err().unwrap().to_string();
-        assert!(error.contains("evaluation.json differs"), "{error}");
+        assert!(error.contains("evaluation.json: training differs: stored {"), "{error}");
     }
 }

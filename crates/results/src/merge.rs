@@ -34,8 +34,8 @@ pub fn merge_shards(shards: &[PathBuf], results: &Path) -> Result<StoredEvaluati
         };
         let whole = EvaluationRecord { shard: None, ..part.record.clone() };
         let (expected, count) = first.get_or_insert_with(|| (whole.clone(), shard.count));
-        if let Some((what, expected, found)) = difference(expected, &whole) {
-            return Err(refuse(folder, what, expected, found));
+        if let Some((what, expected, found)) = expected.difference(&whole) {
+            return Err(refuse(folder, &what, expected, found));
         }
         if *count != shard.count {
             let parts = |count| format!("one of {count} parts");
@@ -60,24 +60,6 @@ pub fn merge_shards(shards: &[PathBuf], results: &Path) -> Result<StoredEvaluati
         }
     }
     joined.finish()
-}
-
-fn difference(a: &EvaluationRecord, b: &EvaluationRecord) -> Option<(&'static str, String, String)> {
-    fn text<T: serde::Serialize>(value: &T) -> String {
-        serde_json::to_string(value).unwrap_or_default()
-    }
-    let pairs = [
-        ("entry", text(&a.entry), text(&b.entry)),
-        ("protocol", text(&a.protocol), text(&b.protocol)),
-        ("versions", text(&a.versions), text(&b.versions)),
-        ("kernels", text(&a.kernels), text(&b.kernels)),
-        ("renderer", text(&a.renderer), text(&b.renderer)),
-        ("sources", text(&a.sources), text(&b.sources)),
-        ("execution", text(&a.execution), text(&b.execution)),
-        ("seeds", text(&a.seeds), text(&b.seeds)),
-        ("training", text(&a.training), text(&b.training)),
-    ];
-    pairs.into_iter().find(|(_, a, b)| a != b)
 }
 
 #[cfg(test)]

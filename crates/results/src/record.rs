@@ -147,6 +147,11 @@ impl TrainingFacts {
     pub fn is_as_long(&self, other: &Self) -> bool {
         (self.minutes - other.minutes).abs() <= 1e-9 * self.minutes.abs()
     }
+
+    /// Whether both are of one training.
+    pub fn is_same(&self, other: &Self) -> bool {
+        self.is_as_long(other) && Self { minutes: other.minutes, ..self.clone() } == *other
+    }
 }
 
 /// A row of seeds.
@@ -282,15 +287,29 @@ impl EvaluationRecord {
         let as_released = || self.changed_sources().is_empty() && other.changed_sources().is_empty();
         let sources = self.sources == other.sources || (unknown && as_released());
         let rest = |of: &Self| {
-            let training = TrainingFacts { minutes: 0.0, ..of.training.clone() };
+            let training = self.training.clone();
             Self { kernels: None, renderer: None, sources: BTreeMap::new(), training, ..of.clone() }
         };
-        let minutes = self.training.is_as_long(&other.training);
         sources
-            && minutes
+            && self.training.is_same(&other.training)
             && told(|of| of.kernels.as_ref())
             && told(|of| of.renderer.as_ref())
             && rest(self) == rest(other)
+    }
+
+    /// The first of its fields that another record has otherwise, and what both say. One that both tell comes before one that only one
+    /// of them tells.
+    pub(crate) fn difference(&self, other: &Self) -> Option<(String, String, String)> {
+        let fields = |of: &Self| match serde_json::to_value(of) {
+            Ok(serde_json::Value::Object(fields)) => fields,
+            _ => serde_json::Map::new(),
+        };
+        let (own, theirs) = (fields(self), fields(other));
+        let mut keys: Vec<&String> = own.keys().chain(theirs.keys()).collect();
+        keys.sort_by_key(|key| (own.get(*key).is_none() || theirs.get(*key).is_none(), *key));
+        let key = keys.into_iter().find(|key| own.get(*key) != theirs.get(*key))?;
+        let text = |of: Option<&serde_json::Value>| of.map_or_else(|| "nothing".to_owned(), ToString::to_string);
+        Some((key.clone(), text(own.get(key)), text(theirs.get(key))))
     }
 
     /// Whether episodes of both may stand in one row: one evaluation, and the same sources or none known of either.
@@ -506,6 +525,15 @@ mod tests {
             all.sort_unstable();
             assert_eq!(all, (10_000..10_017).collect::<Vec<_>>());
         }
+    }
+
+    #[test]
+    fn a_training_is_the_same_whatever_read_its_minutes() {
+        let one = sample("a", 1, 17).training;
+        let read = TrainingFacts { minutes: f64::from_bits(one.minutes.to_bits() + 1), ..one.clone() };
+        assert!(one != read && one.is_same(&read));
+        assert!(!one.is_same(&TrainingFacts { minutes: one.minutes * 1.01, ..one.clone() }));
+        assert!(!one.is_same(&TrainingFacts { steps: one.steps + 1, ..one.clone() }));
     }
 
     #[test]

@@ -45,6 +45,9 @@ pub fn write_table(path: &Path, columns: Vec<(&str, ArrayRef)>) -> Result<(), Re
     write_atomic(path, &bytes)
 }
 
+/// Episodes that a table may hold.
+const MOST_ROWS: usize = 1_000_000;
+
 /// The columns of a table, each whole, checked for name and type.
 struct Columns<'a> {
     path: &'a Path,
@@ -57,7 +60,17 @@ impl<'a> Columns<'a> {
         let reader = ParquetRecordBatchReaderBuilder::try_new(file)
             .and_then(ParquetRecordBatchReaderBuilder::build)
             .map_err(table_error("read table", path))?;
-        let batches: Vec<RecordBatch> = reader.collect::<Result<_, _>>().map_err(table_error("read table", path))?;
+        let (mut batches, mut rows) = (Vec::<RecordBatch>::new(), 0);
+        for batch in reader {
+            let batch = batch.map_err(table_error("read table", path))?;
+            rows += batch.num_rows();
+            // equal rows take no room in a file
+            if rows > MOST_ROWS {
+                let reason = format!("expected at most {MOST_ROWS} rows, found more");
+                return Err(ResultsError::Malformed { path: path.to_owned(), reason });
+            }
+            batches.push(batch);
+        }
         Ok(Self { path, batches })
     }
 

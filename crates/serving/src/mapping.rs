@@ -8,6 +8,7 @@ use serde::Deserialize;
 use crate::codec::{Array, Dtype, Value};
 use crate::error::{Result, ServingError};
 use crate::resize::resize_with_pad;
+use crate::session::{EXECUTED, RESET, SEED};
 
 /// Names of mappings that are built in, and their files.
 const PRESETS: [(&str, &str); 2] = [("actrm", ""), ("openpi-libero", include_str!("presets/openpi-libero.toml"))];
@@ -118,8 +119,11 @@ impl Mapping {
             }
         }
         for (at, item) in mapping.observation.iter().enumerate() {
-            if mapping.observation[..at].iter().any(|other| other.key == item.key) || item.key == "prompt" {
+            if mapping.observation[..at].iter().any(|other| other.key == item.key) {
                 return Err(failed(format!("key: expected each once, found {} again", item.key)));
+            }
+            if ["prompt", RESET, SEED, EXECUTED].contains(&item.key.as_str()) {
+                return Err(failed(format!("key: expected none that a message has anyway, found {}", item.key)));
             }
         }
         Ok(mapping)

@@ -75,7 +75,7 @@ pub(crate) struct Session<'a> {
     steps: &'a Steps,
     policy: Option<Box<dyn Stepper>>,
     suite: String,
-    task: usize,
+    task: Option<usize>,
 }
 
 /// A message's parts.
@@ -121,7 +121,7 @@ pub(crate) fn error(text: String, seq: i128) -> Vec<u8> {
 
 impl<'a> Session<'a> {
     pub fn new(steps: &'a Steps) -> Self {
-        Self { steps, policy: None, suite: String::new(), task: 0 }
+        Self { steps, policy: None, suite: String::new(), task: None }
     }
 
     /// Another one, without an episode.
@@ -173,15 +173,15 @@ impl<'a> Session<'a> {
 
     fn begin(&mut self, payload: &Value<'_>) -> Result<()> {
         let task = payload.get("task");
-        let number = |key: &str| task.and_then(|task| task.get(key)).and_then(Value::count).unwrap_or(0);
+        let number = |key: &str| task.and_then(|task| task.get(key)).and_then(Value::count);
         let text = |key: &str| match task.and_then(|task| task.get(key)) {
             Some(Value::Text(text)) => Some(text.as_ref()),
             _ => None,
         };
         self.suite = text("suite").unwrap_or_default().to_owned();
-        self.task = usize::try_from(number("task_id")).unwrap_or(usize::MAX);
+        self.task = number("task_id").map(|task| usize::try_from(task).unwrap_or(usize::MAX));
         let mut policy = self.policy()?;
-        policy.begin(number("episode_idx"), text("name"));
+        policy.begin(number("episode_idx").unwrap_or(0), text("name"));
         self.policy = Some(policy);
         Ok(())
     }
@@ -194,11 +194,12 @@ impl<'a> Session<'a> {
     }
 
     fn act(&mut self, payload: &Value<'_>) -> Result<Vec<f32>> {
-        let all = self.shown(payload);
-        let Some(policy) = &mut self.policy else {
+        if self.policy.is_none() {
             return Err(ServingError::message("type", "episode_start before the first observation", "none"));
-        };
-        let action = policy.act(all?).map_err(|reason| ServingError::message("action", "one", reason))?;
+        }
+        let all = self.shown(payload)?;
+        let policy = self.policy.as_mut().expect("was there");
+        let action = policy.act(all).map_err(|reason| ServingError::message("action", "one", reason))?;
         match action.iter().find(|number| !number.is_finite()) {
             Some(other) => Err(ServingError::message("actions", "finite numbers from the policy", other.to_string())),
             None => Ok(action),
@@ -224,11 +225,12 @@ impl<'a> Session<'a> {
                 let expected = format!("a suite that numbers tasks as LIBERO does, {suites}");
                 return Err(ServingError::message("suite", expected, shown(&self.suite)));
             }
-            let Some(tasks) = count.filter(|tasks| self.task < *tasks) else {
+            let Some((tasks, this)) = count.zip(self.task).filter(|(tasks, task)| task < tasks) else {
                 let expected = format!("below {}, the tasks that the policy knows", count.unwrap_or(0));
-                return Err(ServingError::message("task_id", expected, self.task.to_string()));
+                let found = self.task.map_or_else(|| "none in episode_start".to_owned(), |task| task.to_string());
+                return Err(ServingError::message("task_id", expected, found));
             };
-            return Ok((0..tasks).map(|task| f64::from(u8::from(task == self.task))).collect());
+            return Ok((0..tasks).map(|task| f64::from(u8::from(task == this))).collect());
         }
         if !STATE.contains(&key) {
             let known = format!("{}, {TASK} and {}", STATE.join(", "), CAMERAS.map(|(_, name, _)| name).join(", "));
@@ -238,10 +240,11 @@ impl<'a> Session<'a> {
         let Some(state) = payload.get("states").and_then(Value::to_array) else {
             return Err(ServingError::message("states", wanted, format!("no such key in {payload}")));
         };
-        let state: Vec<f64> = state.numbers().into_iter().map(f64::from).collect();
-        if state.len() != 8 {
-            return Err(ServingError::message("states", wanted, format!("{} numbers", state.len())));
+        // before its numbers are copied
+        if state.shape().iter().product::<usize>() != 8 {
+            return Err(ServingError::message("states", wanted, format!("{} {:?}", state.dtype(), state.shape())));
         }
+        let state: Vec<f64> = state.numbers().into_iter().map(f64::from).collect();
         if let Some(other) = state.iter().find(|number| !number.is_finite()) {
             return Err(ServingError::message("states", wanted, other.to_string()));
         }

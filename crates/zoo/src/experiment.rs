@@ -297,7 +297,10 @@ impl Experiment {
         if self.rollout.max_steps == Some(0) {
             return invalid("rollout.max_steps", "at least 1".to_owned(), "0".to_owned());
         }
-        self.policy.validate().map_err(self.model_error("build the policy of"))?;
+        let possible = self.policy.validate();
+        let possible =
+            possible.and_then(|()| self.policy.check_data(self.data.n_obs_steps, !self.data.cameras.is_empty()));
+        possible.map_err(self.model_error("build the policy of"))?;
         self.data.check(self.policy.reads())?;
         crate::transforms::check(self)?;
         self.train.check()

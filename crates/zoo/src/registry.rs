@@ -173,8 +173,10 @@ impl Registry {
         let mut aliases = self.aliases(&id.name)?;
         if set {
             aliases.insert(alias.to_owned(), id.version);
-        } else {
-            aliases.remove(alias);
+        } else if aliases.remove(alias).is_none() {
+            let (name, alias) = (id.name, alias.to_owned());
+            let known = aliases.iter().map(|(alias, version)| format!("{alias} = {version}")).collect();
+            return Err(ZooError::UnknownAlias { name, alias, known });
         }
         let text = serde_json::to_string_pretty(&aliases).expect("names and numbers become JSON") + "\n";
         Ok(write_atomic(&self.folder.join(&id.name).join(ALIASES), text.as_bytes())?)

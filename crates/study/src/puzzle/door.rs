@@ -125,6 +125,21 @@ impl AnyExperiment {
         }
     }
 
+    /// The command that collects the demonstrations it expects, as far as it says which; puzzles need none.
+    pub fn collect(&self) -> Option<String> {
+        let Kind::Robot(one) = &self.0 else { return None };
+        let data = &one.data;
+        let out = if data.path.is_empty() { "demos.hdf5" } else { &data.path };
+        let stem = Path::new(out).file_stem().and_then(|stem| stem.to_str()).unwrap_or_default();
+        // experiments name their files so: stack.hdf5, stack-recoveries.hdf5
+        let expert = stem.rsplit_once('-').map_or(String::new(), |(_, expert)| format!(" --expert {expert}"));
+        let cameras = match data.cameras.is_empty() {
+            true => String::new(),
+            false => format!(" --cameras {} --image-size 84 --fast-render --no-next-obs", data.cameras.join(",")),
+        };
+        Some(format!("actrm-data collect --task {} --episodes 200{expert}{cameras} --out {out}", one.task.name))
+    }
+
     /// The demonstrations that it is trained on unless others are named; puzzles take none.
     pub fn data(&self) -> Option<&Path> {
         match &self.0 {

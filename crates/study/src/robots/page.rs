@@ -461,9 +461,12 @@ fn verdict(text: &mut String, study: &Study, compared: &[Vec<Compared<'_>>]) {
     let counted: Vec<&Compared<'_>> = compared.iter().flatten().filter(|c| c.difference.is_some()).collect();
     for c in &counted {
         let ([first, second], [a, b]) = (c.sides(study), c.success.map(|share| 100.0 * share));
-        let (question, answer) = (&c.comparison.question, c.answer(study));
+        let (question, answer, points) = (&c.comparison.question, c.answer(study), c.points());
+        // the interval alone may leave out zero: only p is corrected for the number of questions
+        let p = c.difference.as_ref().map_or(1.0, |(_, p)| *p);
+        let p = if p < 0.001 { "p < 0.001".to_owned() } else { format!("corrected p {p:.3}") };
         let _ =
-            writeln!(text, "- {question} **{answer}**: {a:.1}% ({first}) against {b:.1}% ({second}), {}.", c.points());
+            writeln!(text, "- {question} **{answer}**: {a:.1}% ({first}) against {b:.1}% ({second}), {points}, {p}.");
     }
     if !counted.is_empty() {
         text.push('\n');

@@ -279,25 +279,34 @@ impl Library {
         }
         // a puzzle's name models
         if group != "puzzle" {
-            self.check_combinations(&path, &table)?;
+            self.check_combinations(group, &path, &table)?;
         }
         into.push((name.to_owned(), table));
         chain.pop();
         Ok(())
     }
 
-    /// Checks that every `[for.KEY]` of a task's or a policy's file names something.
-    fn check_combinations(&self, path: &str, table: &Table) -> Result<(), ZooError> {
+    /// Checks that every `[for.KEY]` of a file names what it can change: in a task's file inputs, in a policy's inputs, a task
+    /// or both, in a file of inputs nothing.
+    fn check_combinations(&self, group: &str, path: &str, table: &Table) -> Result<(), ZooError> {
         let Some(all) = table.get("for").and_then(Value::as_table) else { return Ok(()) };
-        let (mut known, tasks) = (self.group("inputs")?, self.group("task")?);
+        let of_policy = group == "policy";
+        let mut known = if group == "inputs" { Vec::new() } else { self.group("inputs")? };
+        let tasks = if of_policy { self.group("task")? } else { Vec::new() };
         for key in all.keys() {
             let combined = longest(&tasks, key).is_some_and(|(_, rest)| known.iter().any(|inputs| inputs == rest));
-            if !combined && !known.contains(key) && !tasks.contains(key) && key != STATE {
+            let names = combined || known.contains(key) || tasks.contains(key) || (key == STATE && group != "inputs");
+            if !names {
                 known.extend(tasks);
                 let hint = nearest(key, &known).map_or(String::new(), |near| format!(" (did you mean `{near}`?)"));
+                let expected = match group {
+                    "inputs" => "no `for` in a file of inputs",
+                    "policy" => "inputs, a task, or a task and inputs such as stack_image",
+                    _ => "inputs, such as image",
+                };
                 return Err(ZooError::InvalidValue {
                     key: format!("{path}: for.{key}"),
-                    expected: "inputs, a task, or a task and inputs such as stack_image".to_owned(),
+                    expected: expected.to_owned(),
                     found: format!("`{key}`{hint}"),
                 });
             }

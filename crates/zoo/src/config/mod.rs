@@ -250,6 +250,16 @@ mod tests {
         assert!(error.starts_with("key `inputs`: expected no change to act_lift, whose file"), "{error}");
         let error = library.resolve("act_here").unwrap_err().to_string();
         assert!(error.contains("`task/here: for.imgae`") && error.contains("did you mean `image`?"), "{error}");
+        // what no combination reads
+        for (file, text, named) in [
+            ("task/here", "[for.here_image.train]\nsteps = 7", "`task/here: for.here_image`: expected inputs"),
+            ("inputs/seen", "[for.lift.train]\nsteps = 7", "`inputs/seen: for.lift`: expected no `for`"),
+        ] {
+            let (_folder, library) = super::tests::library(&[(file, text), ("task/sees", "inputs = ['seen']")]);
+            let name = if file == "task/here" { "act_here" } else { "act_sees_seen" };
+            let error = library.resolve(name).unwrap_err().to_string();
+            assert!(error.contains(named), "{error}");
+        }
     }
 
     #[test]

@@ -22,6 +22,9 @@ pub(crate) fn thinned(rows: impl ExactSizeIterator<Item = Row> + DoubleEndedIter
     points
 }
 
+/// Rows that a curve may have.
+const MOST_ROWS: usize = 2_000_000;
+
 /// Step, loss and validation loss.
 type Row = (u64, Option<f64>, Option<f64>);
 
@@ -57,6 +60,11 @@ fn rows(path: &Path) -> Result<Vec<Row>, ZooError> {
         let reason = "expected a column `step` of unsigned integers".to_owned();
         let steps = steps.ok_or_else(|| ZooError::Malformed { path: path.to_owned(), reason })?;
         let (loss, valid) = (numbers(&batch, "loss"), numbers(&batch, "valid_loss"));
+        // equal rows take no room in a file
+        if rows.len() > MOST_ROWS {
+            let reason = format!("expected at most {MOST_ROWS} rows, found more");
+            return Err(ZooError::Malformed { path: path.to_owned(), reason });
+        }
         rows.extend(steps.values().iter().zip(loss).zip(valid).map(|((step, loss), valid)| (*step, loss, valid)));
     }
     Ok(rows)

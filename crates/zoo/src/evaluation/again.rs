@@ -51,11 +51,11 @@ pub fn evaluate_again(
 ) -> Result<Again, ZooError> {
     let record = subject.record(pool.ready(), options)?;
     let stored = find(results, &record)?;
-    if stored.record.training != record.training {
+    if !stored.record.training.is_same(&record.training) {
         let text = |record: &EvaluationRecord| serde_json::to_string(&record.training).unwrap_or_default();
         return Err(ResultsError::Differ {
             folder: stored.folder,
-            what: "evaluation.json".to_owned(),
+            what: "evaluation.json: training".to_owned(),
             expected: text(&stored.record),
             found: text(&record),
         }

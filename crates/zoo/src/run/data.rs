@@ -235,7 +235,8 @@ pub(super) fn prepare(
     }
     if let Some(both) = valid.iter().find(|episode| train.contains(episode)) {
         return Err(unfit(format!(
-            "masks `{mask}` and `{}` share episode {both}: a validation on training data says nothing",
+            "masks `{mask}` and `{}` share episode {both}: a validation on training data says nothing; \
+             data.valid_mask=\"\" trains without one",
             held_out
         )));
     }
@@ -323,7 +324,7 @@ pub(super) fn prepare(
     let modes = experiment.normalisation.modes(&signature);
     let mut normaliser =
         Normaliser::new(&modes, &statistics).map_err(experiment.model_error("take the statistics for"))?;
-    for guarded in normaliser.guard_constant() {
+    for guarded in normaliser.guard_constant(!(data.mirror.is_empty() && data.symmetries.is_empty())) {
         notes.push(format!(
             "{}[{}] is constant (spread {:e}): normalised to 0",
             guarded.feature, guarded.dim, guarded.spread

@@ -30,6 +30,9 @@ pub struct Extended {
 /// A run that is not finished or is no robot policy's; a schedule that depends on the number of steps; no more steps than it has.
 pub fn extend(run: &Path, runs: &Path, steps: u64) -> Result<Extended, ZooError> {
     let nothing = |reason: &str| ZooError::NothingToResume { folder: run.to_owned(), reason: reason.to_owned() };
+    if !run.is_dir() {
+        return Err(nothing("there is no such folder; `train` prints that of a run, such as runs/act_lift/001"));
+    }
     let Some(entry) = finished_entry(run)? else {
         return Err(nothing("it is not finished; --resume continues it"));
     };
@@ -56,16 +59,24 @@ pub fn extend(run: &Path, runs: &Path, steps: u64) -> Result<Extended, ZooError>
     let command = run.join("begun.txt").is_file().then(|| read("begun.txt")).transpose()?;
     let command = command.map(|begun| begun.trim_end().to_owned() + &more);
     let folder = RunFolder::next(runs, &name)?;
-    copy(
-        run,
-        folder.path(),
-        &["lock", "config.toml", "finished.json", "sealing.json", "begun.txt", super::COMMAND_FILE],
-    )?;
-    if let Some(command) = &command {
-        write_atomic(&folder.begun_path(), format!("{command}\n").as_bytes())?;
+    let fill = || -> Result<(), ZooError> {
+        copy(
+            run,
+            folder.path(),
+            &["lock", "config.toml", "finished.json", "sealing.json", "begun.txt", super::COMMAND_FILE],
+        )?;
+        if let Some(command) = &command {
+            write_atomic(&folder.begun_path(), format!("{command}\n").as_bytes())?;
+        }
+        // last: its presence says that the run was begun
+        write_atomic(&folder.config_path(), experiment.text().as_bytes())?;
+        Ok(())
+    };
+    if let Err(error) = fill() {
+        // the folder is new; whatever cannot be removed is not worth hiding the error
+        let _ = fs::remove_dir_all(folder.path());
+        return Err(error);
     }
-    // last: its presence says that the run was begun
-    write_atomic(&folder.config_path(), experiment.text().as_bytes())?;
     Ok(Extended { name, experiment, folder: folder.path().to_owned(), command })
 }
 

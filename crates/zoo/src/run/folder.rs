@@ -17,12 +17,22 @@ pub(super) const NOTE: &str = "run.json";
 /// The resolved experiment.
 const CONFIG: &str = "config.toml";
 const FINISHED: &str = "finished.json";
+/// The entry that the run is about to get.
+pub(super) const SEALING: &str = "sealing.json";
 
 /// A run's folder, locked for as long as this value lives.
 #[derive(Debug)]
 pub struct RunFolder {
     path: PathBuf,
+    /// Folders that were made for it, innermost first.
+    made: Vec<PathBuf>,
     _lock: File,
+}
+
+/// Folders of a path that are not there yet, innermost first.
+fn missing(path: &Path) -> Vec<PathBuf> {
+    let named = path.ancestors().filter(|folder| !folder.as_os_str().is_empty());
+    named.take_while(|folder| !folder.exists()).map(Path::to_owned).collect()
 }
 
 impl RunFolder {
@@ -32,12 +42,16 @@ impl RunFolder {
     /// When the folder cannot be made.
     pub fn next(runs: &Path, experiment: &str) -> Result<Self, ZooError> {
         let parent = runs.join(experiment);
+        let mut made = missing(&parent);
         fs::create_dir_all(&parent).map_err(ZooError::io("create folder", &parent))?;
         loop {
             let number = numbers(&parent)?.last().map_or(1, |n| n + 1);
             let path = parent.join(format!("{number:03}"));
             match fs::create_dir(&path) {
-                Ok(()) => return Self::lock(path),
+                Ok(()) => {
+                    made.insert(0, path.clone());
+                    return Self::lock(path, made);
+                }
                 Err(e) if e.kind() == std::io::ErrorKind::AlreadyExists => {}
                 Err(e) => return Err(ZooError::io("create folder", path)(e)),
             }
@@ -50,15 +64,21 @@ impl RunFolder {
     /// [`ZooError::RunLocked`] while another training works there, [`ZooError::RunExists`] after one did,
     /// [`ZooError::NotARun`] for a folder with files of others.
     pub fn fresh(path: &Path) -> Result<Self, ZooError> {
+        let made = missing(path);
         fs::create_dir_all(path).map_err(ZooError::io("create folder", path))?;
-        // ours is empty
+        // what a start that was killed left may go, and nothing else: its lock is empty, its data a whole set
+        let data = path.join(super::data::CONVERTED);
+        if data.exists() && !data.join("meta/info.json").is_file() {
+            let found = super::data::CONVERTED.to_owned();
+            return Err(ZooError::NotARun { folder: path.to_owned(), found });
+        }
         let locked = path.join(LOCK).metadata().is_ok_and(|lock| lock.is_file() && lock.len() == 0);
         let first = fs::read_dir(path).map_err(ZooError::io("read folder", path))?.next().transpose();
         if let (false, Some(found)) = (locked, first.map_err(ZooError::io("read folder", path))?) {
             let found = found.file_name().to_string_lossy().into_owned();
             return Err(ZooError::NotARun { folder: path.to_owned(), found });
         }
-        let folder = Self::lock(path.to_owned())?;
+        let folder = Self::lock(path.to_owned(), made)?;
         if folder.config_path().exists() {
             return Err(ZooError::RunExists { folder: path.to_owned() });
         }
@@ -78,7 +98,7 @@ impl RunFolder {
         if !path.join(CONFIG).exists() {
             return Err(nothing("no run was begun there"));
         }
-        let folder = Self::lock(path.to_owned())?;
+        let folder = Self::lock(path.to_owned(), Vec::new())?;
         if folder.finished_path().exists() {
             return Err(nothing("the run is finished"));
         }
@@ -103,21 +123,21 @@ impl RunFolder {
         }
     }
 
-    fn lock(path: PathBuf) -> Result<Self, ZooError> {
+    fn lock(path: PathBuf, made: Vec<PathBuf>) -> Result<Self, ZooError> {
         let file_path = path.join(LOCK);
         let file = File::options().write(true).create(true).truncate(false).open(&file_path);
         let file = file.map_err(ZooError::io("create", &file_path))?;
         if !rollout::try_lock(&file, &path).map_err(ZooError::io("lock", file_path))? {
             return Err(ZooError::RunLocked { folder: path });
         }
-        let folder = Self { path, _lock: file };
+        let folder = Self { path, made, _lock: file };
         sweep(&folder.path)?;
         sweep(&folder.checkpoints())?;
         Ok(folder)
     }
 
-    /// Removes what a run that never began has put here, and the folders that are empty without it. Files of others
-    /// stay, and so does the folder then.
+    /// Removes what a run that never began has put here, and the folders that were made for it. Files of others
+    /// stay, and so do their folders.
     pub(super) fn discard(&self) {
         // whatever cannot be removed is not worth hiding the error that led here
         let _ = fs::remove_dir_all(self.path.join(super::data::CONVERTED));
@@ -125,7 +145,7 @@ impl RunFolder {
         for name in [BEGUN, NOTE, COMMAND_FILE, LOCK] {
             let _ = fs::remove_file(self.path.join(name));
         }
-        for folder in self.path.ancestors().take(3) {
+        for folder in &self.made {
             if fs::remove_dir(folder).is_err() {
                 return;
             }
@@ -149,7 +169,7 @@ impl RunFolder {
 
     /// The entry that the run is about to get.
     pub(super) fn sealing_path(&self) -> PathBuf {
-        self.path.join("sealing.json")
+        self.path.join(SEALING)
     }
 
     /// The command that trains what is trained here, if the run was begun by one.
@@ -210,11 +230,21 @@ mod tests {
         assert!(error.contains("expected a new or empty folder, found data in it"), "{error}");
         assert_eq!(fs::read_to_string(root.path().join("data/mine.hdf5")).unwrap(), "mine");
         assert_eq!(fs::read_dir(root.path()).unwrap().count(), 1);
-        let path = root.path().join("r");
+        // nor do they go where a start that was killed has left its lock
+        fs::write(root.path().join(LOCK), "").unwrap();
+        assert!(RunFolder::fresh(root.path()).is_err());
+        assert_eq!(fs::read_to_string(root.path().join("data/mine.hdf5")).unwrap(), "mine");
+        let path = root.path().join("r/s");
         let folder = RunFolder::fresh(&path).unwrap();
         fs::create_dir(path.join("data")).unwrap();
         folder.discard();
-        assert!(!path.exists());
+        assert!(!path.exists() && !root.path().join("r").exists());
+        // an empty folder of the user's stays
+        fs::create_dir_all(&path).unwrap();
+        RunFolder::fresh(&path).unwrap().discard();
+        assert_eq!(fs::read_dir(&path).unwrap().count(), 0);
+        RunFolder::next(&path, "e").unwrap().discard();
+        assert_eq!(fs::read_dir(&path).unwrap().count(), 0);
     }
 
     #[test]

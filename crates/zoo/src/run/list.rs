@@ -50,11 +50,12 @@ pub struct FoundRun {
     pub command: Option<String>,
 }
 
-/// Every run that was begun under `runs`, by experiment and number. A folder that is not there holds none.
+/// Every run that was begun under `runs`, by experiment and number. A folder that is not there holds none. A run whose notes cannot
+/// be read hides no other: it is left out and told to `left_out`.
 ///
 /// # Errors
-/// Folders and notes that cannot be read.
-pub fn list_runs(runs: &Path) -> Result<Vec<FoundRun>, ZooError> {
+/// Folders that cannot be read.
+pub fn list_runs(runs: &Path, left_out: &mut dyn FnMut(ZooError)) -> Result<Vec<FoundRun>, ZooError> {
     let mut found = Vec::new();
     if !runs.is_dir() {
         return Ok(found);
@@ -65,18 +66,27 @@ pub fn list_runs(runs: &Path) -> Result<Vec<FoundRun>, ZooError> {
             if !config.is_file() {
                 continue;
             }
-            let text = fs::read_to_string(&config).map_err(ZooError::io("read", &config))?;
-            found.push(FoundRun {
-                experiment: parent.file_name().unwrap_or_default().to_string_lossy().into_owned(),
-                state: state(&folder)?,
-                step: Checkpoint::latest_step(&folder.join("checkpoints"))?,
-                steps: steps(&text),
-                command: fs::read_to_string(folder.join(COMMAND_FILE)).ok().map(|text| text.trim_end().to_owned()),
-                folder,
-            });
+            let experiment = parent.file_name().unwrap_or_default().to_string_lossy().into_owned();
+            match one(folder, experiment) {
+                Ok(run) => found.push(run),
+                Err(error) => left_out(error),
+            }
         }
     }
     Ok(found)
+}
+
+fn one(folder: PathBuf, experiment: String) -> Result<FoundRun, ZooError> {
+    let config = folder.join("config.toml");
+    let text = fs::read_to_string(&config).map_err(ZooError::io("read", &config))?;
+    Ok(FoundRun {
+        experiment,
+        state: state(&folder)?,
+        step: Checkpoint::latest_step(&folder.join("checkpoints"))?,
+        steps: steps(&text),
+        command: fs::read_to_string(folder.join(COMMAND_FILE)).ok().map(|text| text.trim_end().to_owned()),
+        folder,
+    })
 }
 
 fn state(folder: &Path) -> Result<RunState, ZooError> {
@@ -120,7 +130,12 @@ mod tests {
     #[test]
     fn runs_are_told_apart_by_how_they_stand() {
         let root = tempfile::tempdir().unwrap();
-        assert!(list_runs(&root.path().join("none")).unwrap().is_empty());
+        let list = |folder: &Path| {
+            let mut left_out = Vec::new();
+            let found = list_runs(folder, &mut |error| left_out.push(error.to_string())).unwrap();
+            (found, left_out)
+        };
+        assert!(list(&root.path().join("none")).0.is_empty());
         let begin = |text: &str| {
             let folder = RunFolder::next(root.path(), "e").unwrap();
             fs::write(folder.config_path(), text).unwrap();
@@ -137,7 +152,8 @@ mod tests {
         fs::write(finished.finished_path(), "{}").unwrap();
         drop(finished);
         drop(RunFolder::next(root.path(), "e").unwrap());
-        let found = list_runs(root.path()).unwrap();
+        let (found, left_out) = list(root.path());
+        assert!(left_out.is_empty());
         let short: Vec<_> = found.iter().map(|run| (run.state, run.step, run.steps)).collect();
         assert_eq!(
             short,
@@ -145,6 +161,11 @@ mod tests {
         );
         assert_eq!(found[1].command.as_deref(), Some("actrm-zoo train e"));
         drop(training);
-        assert_eq!(list_runs(root.path()).unwrap()[0].state, RunState::Stopped);
+        assert_eq!(list(root.path()).0[0].state, RunState::Stopped);
+        // a damaged run is named and hides no other
+        fs::write(root.path().join("e/002/checkpoints/latest.json"), "{").unwrap();
+        let (found, left_out) = list(root.path());
+        assert_eq!((found.len(), left_out.len()), (2, 1));
+        assert!(left_out[0].contains("latest.json"), "{left_out:?}");
     }
 }

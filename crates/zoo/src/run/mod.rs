@@ -30,6 +30,8 @@ pub use metrics::{Metrics, MetricsRow};
 pub use models::DeviceChoice;
 pub use score::{Score, ScoreRequest, score, score_folder};
 pub use section::{OptimiserKind, TrainSection, WeightsFormat};
-pub use session::{Place, Settings, TrainEvent, TrainOutcome, Training, finished_entry, run, same_settings};
+pub use session::{
+    Place, Settings, TrainEvent, TrainOutcome, Training, finished_entry, finished_in, run, same_settings,
+};
 pub use tensorboard::EventWriter;
 pub use training::{TrainRequest, train};

@@ -58,7 +58,11 @@ fn available_memory() -> Option<f64> {
     let text = std::fs::read_to_string("/proc/meminfo").ok()?;
     let line = text.lines().find_map(|line| line.strip_prefix("MemAvailable:"))?;
     let machine = line.trim().strip_suffix("kB")?.trim().parse::<f64>().ok()? * 1024.0;
-    let group = number("/sys/fs/cgroup/memory.max").unwrap_or(f64::INFINITY);
+    // files in memory count as used there, and go when memory is asked for
+    let used = number("/sys/fs/cgroup/memory.current").unwrap_or(0.0);
+    let stat = std::fs::read_to_string("/sys/fs/cgroup/memory.stat").unwrap_or_default();
+    let files = stat.lines().find_map(|line| line.strip_prefix("inactive_file ")?.parse::<f64>().ok()).unwrap_or(0.0);
+    let group = number("/sys/fs/cgroup/memory.max").map_or(f64::INFINITY, |most| most - (used - files).max(0.0));
     Some(machine.min(group))
 }
 

@@ -13,7 +13,7 @@ use crate::entry::{CurvePoint, ENTRY_FILE, Entry, EntryDraft, EntryId, TRAIN_FIL
 use crate::{ZooError, sha256_file, write_atomic};
 
 use super::checkpoint::Checkpoint;
-use super::folder::RunFolder;
+use super::folder::{RunFolder, SEALING};
 use super::metrics::{Metrics, MetricsRow};
 use super::preflight;
 use super::section::TrainSection;
@@ -228,6 +228,22 @@ fn finish(folder: &RunFolder, entry: EntryId, training: &TrainingMeta) -> Result
     Ok(TrainOutcome::Finished { entry, run: folder.path().to_owned(), minutes })
 }
 
+/// The entry that the run in `folder` made, as `name@version`; nothing while it is not finished. With it, whether the zoo has it.
+///
+/// # Errors
+/// A note that cannot be read or names none.
+pub fn finished_in(folder: &Path, zoo: &Path) -> Result<Option<(String, bool)>, ZooError> {
+    let Some(entry) = finished_entry(folder)? else { return Ok(None) };
+    let there = match sealing(folder)? {
+        Some(note) => note.is_in(zoo)?,
+        // a run from before there was a note
+        None => {
+            entry.split_once('@').is_some_and(|(name, version)| zoo.join(name).join(version).join(ENTRY_FILE).is_file())
+        }
+    };
+    Ok(Some((entry, there)))
+}
+
 /// The entry that the run in `folder` made, as `name@version`; nothing while it is not finished.
 ///
 /// # Errors
@@ -258,21 +274,31 @@ struct Sealing {
     sha256: String,
 }
 
-/// The entry that an earlier session of this run has sealed into `zoo`.
-fn sealed(folder: &RunFolder, zoo: &Path) -> Result<Option<Entry>, ZooError> {
-    let path = folder.sealing_path();
+impl Sealing {
+    fn is_in(&self, zoo: &Path) -> Result<bool, ZooError> {
+        let file = zoo.join(&self.name).join(self.version.to_string()).join(ENTRY_FILE);
+        Ok(file.is_file() && sha256_file(&file)? == self.sha256)
+    }
+}
+
+/// The note in a run's folder, if there is one.
+fn sealing(folder: &Path) -> Result<Option<Sealing>, ZooError> {
+    let path = folder.join(SEALING);
     if !path.exists() {
         return Ok(None);
     }
     let text = std::fs::read(&path).map_err(ZooError::io("read", &path))?;
-    let note: Sealing = serde_json::from_slice(&text)
-        .map_err(|e| ZooError::Malformed { path, reason: format!("not the note of an entry: {e}") })?;
-    let id = EntryId { name: note.name, version: note.version };
-    let file = zoo.join(&id.name).join(id.version.to_string()).join(ENTRY_FILE);
-    if !file.is_file() || sha256_file(&file)? != note.sha256 {
+    let note = serde_json::from_slice(&text);
+    note.map(Some).map_err(|e| ZooError::Malformed { path, reason: format!("not the note of an entry: {e}") })
+}
+
+/// The entry that an earlier session of this run has sealed into `zoo`.
+fn sealed(folder: &RunFolder, zoo: &Path) -> Result<Option<Entry>, ZooError> {
+    let Some(note) = sealing(folder.path())? else { return Ok(None) };
+    if !note.is_in(zoo)? {
         return Ok(None);
     }
-    Entry::open(zoo, &id).map(Some)
+    Entry::open(zoo, &EntryId { name: note.name, version: note.version }).map(Some)
 }
 
 /// A run under way.

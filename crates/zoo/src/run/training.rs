@@ -176,6 +176,9 @@ impl PolicyTraining {
             (None, None) => PathBuf::from(&experiment.data.path),
         };
         let path = data::locate(&wanted)?;
+        if request.data.is_none() && earlier.is_none() && !wanted.exists() {
+            on_event(TrainEvent::Note(&format!("demonstrations: {}", path.display())));
+        }
         let (dataset, converted) = data::open(&path, folder.path(), experiment, &mut |done, total| {
             on_event(TrainEvent::Converting(done, total));
         })?;

@@ -58,7 +58,7 @@ impl Transform for AuxiliaryTargets {
         let Some((column, width)) = column else { return Ok(None) };
         let mut normaliser = Normaliser::new(&[(column.to_owned(), NormMode::MeanStd)].into(), source.statistics)
             .map_err(source.experiment.model_error("take the statistics for"))?;
-        normaliser.guard_constant();
+        normaliser.guard_constant(true);
         Ok(Some(Box::new(Targets { column: column.to_owned(), width, normaliser })))
     }
 }

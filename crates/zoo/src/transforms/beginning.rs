@@ -20,16 +20,20 @@ pub struct BeginningSection {
 
 pub(super) struct Beginning;
 
+/// Every window is drawn so often at most.
+const MOST: usize = 1000;
+
 impl Transform for Beginning {
     fn name(&self) -> &'static str {
         "beginning"
     }
 
     fn check(&self, experiment: &Experiment, _: &[String]) -> Result<(), ZooError> {
-        match experiment.data.beginning.filter(|beginning| beginning.steps == 0 || beginning.times == 0) {
+        let possible = |number: &usize| (1..=MOST).contains(number);
+        match experiment.data.beginning.filter(|of| !(possible(&of.steps) && possible(&of.times))) {
             Some(BeginningSection { steps, times }) => Err(ZooError::InvalidValue {
                 key: "data.beginning".to_owned(),
-                expected: "1 or more".to_owned(),
+                expected: format!("1 to {MOST}"),
                 found: format!("steps {steps}, times {times}"),
             }),
             None => Ok(()),

@@ -49,7 +49,7 @@ fn is_one(count: &usize) -> bool {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct DataSection {
-    /// Demonstrations: an HDF5 file or a LeRobotDataset folder. A relative path starts at the current folder or at the shipped data.
+    /// Demonstrations: an HDF5 file or a LeRobotDataset folder. A relative path is looked up in the current folder, in those above it, then in those above the program.
     pub path: String,
     /// Observation keys that make `observation.state`, in order.
     pub state_keys: Vec<String>,

@@ -1,5 +1,4 @@
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::Path;
 use std::process::ExitCode;
 
 use anyhow::{Context, bail};
@@ -83,11 +82,10 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if args.until_decided {
         return until_decided(args, &sides);
     }
-    let results = args.results.folder(&args.zoo);
     let [first, second] = rows(args, [&sides[0], &sides[1]])?;
     let found = pairs(&first, &second, sides[0] == sides[1]);
     if found.is_empty() {
-        bail!("{}", nothing(&sides, [&first, &second], &results));
+        bail!("{}", nothing(args, &sides, [&first, &second]));
     }
     let told: Vec<Told> = found.iter().map(|(one, two)| Told::of(one, two)).collect();
     match args.json {
@@ -110,7 +108,11 @@ fn rows(args: &Args, sides: [&[EntryId]; 2]) -> anyhow::Result<[Vec<LeaderboardR
             ids.iter().any(|id| id.name == one.record.entry.name && id.version == one.record.entry.version)
         };
         let own: Vec<StoredEvaluation> = audit.standing.iter().filter(of).cloned().collect();
-        rank(&own, &reading)
+        let mut rows = rank(&own, &reading);
+        if let Some(task) = &args.run.task {
+            rows.retain(|row| row.task() == task);
+        }
+        rows
     }))
 }
 
@@ -127,10 +129,7 @@ fn with_files(args: &Args, files: [bool; 2]) -> anyhow::Result<ExitCode> {
         let ids = registry.matching(text)?;
         let [rows, _] = rows(args, [&ids, &[]])?;
         if rows.is_empty() {
-            bail!(
-                "{text}: no evaluations in {}; make some with: actrm-zoo eval",
-                shown(&args.results.folder(&args.zoo))
-            );
+            bail!("{text}: {}", none(args));
         }
         rows.iter().map(Side::of_row).collect()
     };
@@ -143,13 +142,20 @@ fn with_files(args: &Args, files: [bool; 2]) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
+/// That a side has no evaluations, of the asked task if there is one.
+fn none(args: &Args) -> String {
+    let of = args.run.task.as_ref().map(|task| format!(" of {task}")).unwrap_or_default();
+    format!("no evaluations{of} in {}; make some with: actrm-zoo eval", shown(&args.results.folder(&args.zoo)))
+}
+
 /// Why no two rows of both sides can be compared.
-fn nothing(sides: &[Vec<EntryId>; 2], rows: [&[LeaderboardRow]; 2], results: &Path) -> String {
+fn nothing(args: &Args, sides: &[Vec<EntryId>; 2], rows: [&[LeaderboardRow]; 2]) -> String {
     let ids = |ids: &[EntryId]| ids.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");
-    let (one, two, results) = (ids(&sides[0]), ids(&sides[1]), shown(results));
+    let (one, two) = (ids(&sides[0]), ids(&sides[1]));
     if let Some((_, side)) = rows.iter().zip([&one, &two]).find(|(rows, _)| rows.is_empty()) {
-        return format!("{side}: no evaluations in {results}; make some with: actrm-zoo eval");
+        return format!("{side}: {}", none(args));
     }
+    let results = shown(&args.results.folder(&args.zoo));
     if sides[0] == sides[1] {
         let how = "evaluate it in another way, such as with --n-action-steps, or name another entry";
         return format!(

@@ -26,7 +26,7 @@ use crate::videos;
 /// seeds and a bootstrap between families, with Holm's correction over the whole table.
 ///
 /// A result without a valid seal or a matching entry is named and left out, and the exit code is 1. Policies that were evaluated
-/// on several tasks are also compared across tasks, in leaderboard_across.csv.
+/// on several tasks are also compared across tasks, in leaderboard_across.csv: compare only rows with the same tasks.
 ///
 /// The report is one file that needs no network. It has the tables, pairwise comparisons, and success over control steps,
 /// demonstrations and refinement steps. It also has films (`eval --video`, `--video-failed`, at most 20 MB) and the commands

@@ -1,3 +1,4 @@
+use std::collections::BTreeSet;
 use std::process::ExitCode;
 
 use cli::shown;
@@ -26,7 +27,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         anyhow::bail!("{text}: expected a version, such as {}", registry.resolve(text)?);
     }
     // all are there before the first is gone
-    let ids = args.entries.iter().map(|text| registry.resolve(text)).collect::<Result<Vec<_>, _>>()?;
+    let ids = args.entries.iter().map(|text| registry.resolve(text)).collect::<Result<BTreeSet<_>, _>>()?;
     for id in ids {
         registry.remove(&id, &args.results.folder(&args.zoo))?;
         cli::print(&format!("{id} is no longer in {}\n", shown(&args.zoo.zoo)))?;

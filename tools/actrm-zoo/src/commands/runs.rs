@@ -28,7 +28,7 @@ pub struct Args {
 }
 
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
-    let mut runs = list_runs(&args.runs)?;
+    let mut runs = list_runs(&args.runs, &mut |error| cli::note(&format!("note: left out: {error}")))?;
     runs.retain(|run| args.all || run.state != RunState::Finished);
     if args.json {
         let one = |run: &FoundRun| {

@@ -12,7 +12,7 @@ use zoo::ZooError;
 use zoo::config::{Library, nearest};
 use zoo::entry::member_name;
 use zoo::run::{
-    COMMAND_FILE, Extended, Place, TrainEvent, TrainOutcome, TrainRequest, extend, finished_entry, locate, short_hash,
+    COMMAND_FILE, Extended, Place, TrainEvent, TrainOutcome, TrainRequest, extend, finished_in, locate, short_hash,
     train,
 };
 use zoo::write_atomic;
@@ -62,7 +62,7 @@ pub struct Args {
     #[arg(long, value_name = "ENTRY", add = entry_names())]
     from: Option<String>,
     /// Continue the finished run in this folder, in a new folder, to `train.steps=N`; its schedule must be constant
-    #[arg(long, value_name = "RUN", conflicts_with_all = ["run", "resume", "seeds", "data", "from"])]
+    #[arg(long, value_name = "RUN", conflicts_with_all = ["run", "resume", "seeds", "data", "from", "print_config"])]
     extend: Option<PathBuf>,
     /// Train even if the demonstrations are of another task or their dimensions have other names
     #[arg(long)]
@@ -132,6 +132,13 @@ impl Args {
             bail!("experiment {}: no such file", shown(path));
         }
         let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        if let Some(ignored) = self.configs.configs.as_deref().filter(|configs| *configs != folder) {
+            cli::note(&format!(
+                "note: {} is not read: the experiment is a file, and others come from its folder, {}",
+                shown(ignored),
+                shown(folder)
+            ));
+        }
         let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
         Ok(Self { experiment: name, configs: ConfigArgs { configs: Some(folder.to_owned()) }, ..self.clone() })
     }
@@ -190,6 +197,11 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         cli::print(&experiment.to_toml())?;
         return Ok(ExitCode::SUCCESS);
     }
+    // only the paths of experiments are looked up elsewhere, too
+    if let Some(path) = args.data.as_ref().filter(|path| !path.exists()) {
+        let (path, tried) = (path.clone(), Vec::new());
+        return Err(where_data_is(ZooError::DataNotFound { path, tried }, &experiment));
+    }
     let asked =
         Stop::install("stopped without a new checkpoint; --resume continues from the last one, if there is one")?;
     let Some(TrainingSeeds(seeds)) = &args.seeds else {
@@ -202,22 +214,22 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     // other settings or demonstrations are another family, with runs of its own
     let data = experiment.data().map(|data| args.data.as_deref().unwrap_or(data));
     let data = data.map(|data| short_hash(&locate(data)?)).transpose();
-    let data = data.map_err(|error| where_data_is(error, &experiment.summary(&args.experiment).task))?;
+    let data = data.map_err(|error| where_data_is(error, &experiment))?;
     let settings = zoo::sha256_hex(format!("{}\n{data:?}", experiment.to_toml()).as_bytes());
     for &seed in seeds {
         let name = member_name(experiment.entry(), seed);
         let own = vec![format!("train.seed={seed}"), format!("entry={name}")];
         let overrides: Vec<String> = args.overrides.iter().chain(&own).cloned().collect();
         let run = args.runs.join(&args.experiment).join(format!("{}-s{seed}", &settings[..8]));
-        if let Some(entry) = finished_entry(&run)? {
+        if let Some((entry, there)) = finished_in(&run, &args.zoo.zoo)? {
+            let (run, zoo) = (shown(&run), shown(&args.zoo.zoo));
             // of another zoo, or removed: it has to be trained again, which only the user can decide
-            let id = args.zoo.registry().resolve(&entry).with_context(|| {
-                format!(
-                    "seed {seed}: {} is finished and made {entry}; remove that folder to train it again",
-                    shown(&run)
-                )
-            })?;
-            cli::print(&format!("{id} is in {} already (run {})\n", shown(&args.zoo.zoo), shown(&run)))?;
+            if !there {
+                bail!(
+                    "seed {seed}: {run} is finished and made {entry}, which is not in {zoo}; remove that folder to train it again"
+                );
+            }
+            cli::print(&format!("{entry} is in {zoo} already (run {run})\n"))?;
             continue;
         }
         let one = One { resume: run.join("config.toml").is_file(), run: Some(run), seeded: true, own };
@@ -295,16 +307,16 @@ struct One {
 }
 
 /// An error, with what to do where demonstrations are missing or a run began with other settings.
-fn where_data_is(error: ZooError, task: &str) -> anyhow::Error {
+fn where_data_is(error: ZooError, experiment: &AnyExperiment) -> anyhow::Error {
     match error {
         ZooError::ResumeMismatch { ref folder, .. } => match std::fs::read_to_string(folder.join(COMMAND_FILE)) {
             Ok(command) => anyhow!("{error}; it is resumed by: {}", command.trim_end()),
             Err(_) => error.into(),
         },
         ZooError::DataNotFound { path, .. } => anyhow!(
-            "no demonstrations at {}: name yours with --data PATH, or record some with `actrm-data collect --task {task} \
-             --episodes 200 --out demos.hdf5`",
-            shown(&path)
+            "no demonstrations at {}: name yours with --data PATH, or record some with `{}`",
+            shown(&path),
+            experiment.collect().unwrap_or_default()
         ),
         other => other.into(),
     }
@@ -335,13 +347,13 @@ fn train_one(args: &Args, experiment: AnyExperiment, one: &One, asked: &Stop) ->
         }
         show(&event, &mut screen, asked);
     };
-    let task = experiment.summary(&args.experiment).task;
+    let described = experiment.clone();
     let outcome = experiment.train(options, &stop, &mut on_event);
     drop(screen);
     if let Some(error) = unwritten {
         cli::note(&format!("note: {error}"));
     }
-    let outcome = outcome.map_err(|error| where_data_is(error, &task))?;
+    let outcome = outcome.map_err(|error| where_data_is(error, &described))?;
     match outcome {
         TrainOutcome::Finished { entry, run, minutes } => {
             let (zoo, run) = (shown(&args.zoo.zoo), shown(&run));
