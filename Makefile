@@ -114,7 +114,7 @@ demo: demo-cost programs ## the whole line: demonstrations, data set, training, 
 # Said before anything is built.
 .PHONY: demo-cost
 demo-cost:
-	@echo "make demo takes about 12 minutes on two idle cores the first time (9 to compile, 3 to run), then 3, and 4 GB of disk."
+	@echo "make demo takes about 12 minutes on two idle cores the first time (9 to compile, 3 to run), then 3, and 6 GB of disk."
 
 .PHONY: wheel
 wheel: .venv/.complete .venv-wheel/.complete ## the Python package, with the programs in it, in target/wheels
@@ -203,5 +203,5 @@ references: build .venv-peers/.complete ## LeRobot and robomimic train on our de
 	@tools/references.sh
 
 .PHONY: clean
-clean: ## remove what was built and installed (target, .venv, .venv-peers, out)
+clean: ## remove everything built, installed or collected: target, all .venv*, out with its demonstrations
 	@rm -rf target .venv .venv-libero .venv-peers .venv-wheel .venv-cuda .venv-docs out

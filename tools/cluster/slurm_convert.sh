@@ -7,7 +7,7 @@
 # SOURCE and OUT are plain paths that all nodes see, or addresses that fsspec knows (s3://, gs://); then a node needs disk for
 # a shard only, and the one that merges for the data set. This folder must lie on a file system that all nodes see.
 # SBATCH_OPTIONS holds further options for all jobs (partition, account, time); ACTRM_DATA names the program if it is not on
-# PATH, ACTRM_PYTHON the interpreter (python3) with fsspec, s3fs or gcsfs, and h5py. What is staged lies in $TMPDIR. A shard
+# PATH, ACTRM_CLUSTER_PYTHON the interpreter (python3) with fsspec, s3fs or gcsfs, and h5py. What is staged lies in $TMPDIR. A shard
 # that failed or was preempted is converted again when its task is submitted again: `scontrol requeue JOB_TASK`.
 set -euo pipefail
 
@@ -17,7 +17,7 @@ if [[ $# -lt 3 || ! $1 =~ ^[1-9][0-9]*$ ]]; then
 fi
 shards=$1 source=$2 out=$3
 shift 3
-stages=("${ACTRM_PYTHON:-python3}" "$(realpath "$(dirname "$0")")/convert_stages.py")
+stages=("${ACTRM_CLUSTER_PYTHON:-python3}" "$(realpath "$(dirname "$0")")/convert_stages.py")
 read -ra options <<<"${SBATCH_OPTIONS:-}"
 quoted() { printf '%q ' "${stages[@]}" "$@"; }
 

@@ -2,8 +2,9 @@
 //!
 //! Each task is either one of the published small-TRM study's, with its rules to the letter (`maze8-original`,
 //! `maze10-original`, `maze5-rl`), or a repaired one in which something has to be found out (`open8`, `dfs10`, `dfs16`,
-//! `dfs20`, `maze5-walls`, `sudoku4`, `sudoku6`, `sudoku9`). Every puzzle comes with its exact answer, and belongs to the
-//! training, validation or test split by its content, so that no maze and no solution is ever in two of them.
+//! `dfs20`, `maze5-walls`, `sudoku4`, `sudoku6`, `sudoku9`, `sudoku9-hard`). Every puzzle comes with its exact answer. A repaired one
+//! belongs to the training, validation or test split by its content, so that no maze and no solution is in two of them; the original
+//! tasks have no splits.
 //!
 //! This crate knows nothing of tensors, models, files or training.
 

@@ -13,7 +13,7 @@ use std::process::ExitCode;
 
 /// Demonstrations for robot learning: look at them, collect them, convert them, check them.
 ///
-/// Reads robomimic-family HDF5 (robomimic, robosuite, MimicGen, LIBERO, robocasa, D4RL, ALOHA) and writes
+/// Reads demonstrations of many kinds (HDF5, zarr, RLDS, LeRobot v2: `convert --help` lists them) and writes
 /// LeRobotDataset v3.0 directories of Parquet files, from which the original file can be rebuilt.
 #[derive(Parser)]
 #[command(name = "actrm-data", version, propagate_version = true, arg_required_else_help = true, max_term_width = 100)]

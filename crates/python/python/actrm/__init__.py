@@ -80,7 +80,7 @@ def convert(
     lossless: bool = True,
     jobs: int = 0,
 ) -> dict[str, Any]:
-    """Convert demonstrations (HDF5 of robomimic's family) into a LeRobotDataset v3.0 folder.
+    """Convert demonstrations (HDF5, zarr, RLDS or LeRobot v2) into a LeRobotDataset v3.0 folder.
 
     `dst` appears whole or not at all; Ctrl-C leaves nothing behind. Other Python threads keep running.
 

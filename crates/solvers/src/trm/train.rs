@@ -83,7 +83,7 @@ pub struct Trainer {
     rng: Rng,
 }
 
-/// Right cells, labelled cells and whether all are right, per puzzle.
+/// Right cells and labelled cells, per puzzle.
 fn grade(logits: &Tensor, labels: &[i64]) -> Result<Vec<(usize, usize)>> {
     let (batch, len, _) = logits.dims3()?;
     let predicted = logits.argmax(2)?.flatten_all()?.to_vec1::<u32>()?;
