@@ -353,7 +353,7 @@ fn windows(set: &Dataset) -> Result<f64, AnyError> {
     let mut checksum = 0.0_f32;
     let (cpu, start) = (cpu_seconds()?, Instant::now());
     for epoch in 0.. {
-        let order = windows.shuffled(1, epoch);
+        let order = dataset::shuffle::order(1, epoch, windows.len());
         for indices in order.chunks_exact(64) {
             windows.gather(indices, &mut batch);
             checksum += batch.actions[0];

@@ -343,8 +343,8 @@ pub enum InputError {
         advice: String,
     },
 
-    /// The reading process ended without an answer: the file crashed the library that reads its kind.
-    #[error("{path}: damaged: the process that reads it {how} while it was to {during}", path = path.display())]
+    /// The reading process ended without an answer: the file crashed the library that reads its kind, or took more than it may.
+    #[error("{path}: the process that reads it {how} while it was to {during}", path = path.display())]
     ReaderDied {
         /// The file.
         path: PathBuf,

@@ -78,7 +78,11 @@ pub(crate) fn chosen(encoder: VideoEncoder) -> Result<Option<Chosen>> {
     let needed = |library| of(library).map(Some).map_err(|reason| DatasetError::Ffmpeg { reason });
     match encoder {
         VideoEncoder::Builtin => Ok(None),
-        VideoEncoder::Auto => Ok(of(Library::SvtAv1).ok()),
+        // one that was named is wanted
+        VideoEncoder::Auto => match (std::env::var_os(VARIABLE), found()) {
+            (Some(_), Err(reason)) => Err(DatasetError::Ffmpeg { reason: reason.to_owned() }),
+            _ => Ok(of(Library::SvtAv1).ok()),
+        },
         VideoEncoder::SvtAv1 => needed(Library::SvtAv1),
         VideoEncoder::H264 => needed(Library::X264),
     }

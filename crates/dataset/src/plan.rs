@@ -178,7 +178,7 @@ impl Plan {
 
     /// Steps of all demos together.
     pub fn frames(&self) -> usize {
-        self.demos.iter().map(|d| d.length).sum()
+        self.demos.iter().fold(0, |frames, demo| frames.saturating_add(demo.length))
     }
 
     /// Demos that the source names and that cannot be opened at all, by id, and why.
@@ -228,6 +228,18 @@ impl Plan {
     pub fn position(&self, id: &str) -> Option<usize> {
         self.demos.iter().position(|d| d.id == id)
     }
+}
+
+/// Begins the names of the environment's arguments in messages.
+pub(crate) const ENV_KWARGS: &str = "env_args.env_kwargs.";
+
+/// What is said of an argument of the environment in which the files of a folder differ.
+pub(crate) fn at_odds<'p>(problems: &'p [Problem], argument: &str) -> Option<&'p InputError> {
+    let of = |error: &InputError| match error {
+        InputError::BadAttribute { attribute, .. } => attribute.strip_prefix(ENV_KWARGS) == Some(argument),
+        _ => false,
+    };
+    problems.iter().map(|problem| &problem.error).find(|error| of(error))
 }
 
 /// One demo, unread.

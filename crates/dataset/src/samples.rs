@@ -9,13 +9,11 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use crate::error::{DatasetError, Result};
-use crate::lerobot::{Dataset, DepthUnit, Feature, Pictures};
+use crate::lerobot::{Dataset, DepthUnit, Feature, Pictures, TIME_TOLERANCE};
 use crate::windows::Resident;
 
 /// The most rows of one column in one sample.
 const MOST_OFFSETS: usize = 100_000;
-/// LeRobot's tolerance for the time of a frame, in seconds.
-const TOLERANCE: f64 = 1e-4;
 /// Beyond so many frames no data set reaches.
 const FARTHEST: f64 = 1e12;
 
@@ -164,12 +162,12 @@ impl Dataset {
     /// Offsets in frames of these times in seconds, as LeRobot reads `delta_timestamps`.
     ///
     /// # Errors
-    /// A time that is no frame's, by LeRobot's tolerance of 1e-4 s.
+    /// A time that is no frame's, by LeRobot's tolerance.
     pub fn offsets(&self, column: &str, seconds: &[f64]) -> Result<Vec<i64>> {
         let fps = self.info().fps;
         let offset = |&time: &f64| {
             let frames = (time * fps).round();
-            if ((frames / fps) - time).abs() <= TOLERANCE && frames.abs() < FARTHEST {
+            if ((frames / fps) - time).abs() <= TIME_TOLERANCE && frames.abs() < FARTHEST {
                 return Ok(frames as i64);
             }
             Err(DatasetError::NotInDataset {

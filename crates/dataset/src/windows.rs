@@ -187,11 +187,6 @@ impl Windows {
         self.action.dim
     }
 
-    /// Every window once, in an order that depends on `seed` and `epoch` only.
-    pub fn shuffled(&self, seed: u64, epoch: u64) -> Vec<u32> {
-        crate::shuffle::order(seed, epoch, self.spans.len())
-    }
-
     /// Whether pictures are read from files.
     pub fn reads_files(&self) -> bool {
         self.pictures.iter().any(|(_, pictures)| matches!(pictures, PictureStore::File(_)))
@@ -398,17 +393,6 @@ mod tests {
                 prop_assert_eq!(batch.column(name).unwrap(), &seen);
             }
         }
-    }
-
-    #[test]
-    fn an_epoch_visits_every_window_once_in_its_own_order() {
-        let c = column(30, 2, 0.0);
-        let windows = Windows::new(vec![("c".to_owned(), c.clone())], c, (1, 4), &[(0, 10), (20, 30)]);
-        let mut first = windows.shuffled(3, 0);
-        assert_eq!(first, windows.shuffled(3, 0));
-        assert_ne!(first, windows.shuffled(3, 1));
-        first.sort_unstable();
-        assert_eq!(first, (0..20).collect::<Vec<u32>>());
     }
 
     #[test]

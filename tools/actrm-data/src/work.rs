@@ -31,6 +31,11 @@ impl Work {
         Ok(Self { stop, parents })
     }
 
+    /// What Ctrl-C asks to stop.
+    pub fn stop(&self) -> &Stop {
+        &self.stop
+    }
+
     /// Whether to go on.
     pub fn goes_on(&self) -> ControlFlow<()> {
         if self.stop.asked() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }

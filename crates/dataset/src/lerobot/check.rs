@@ -4,13 +4,13 @@
 //! nothing that is trained on depends on it (the sizes at which a writer closes files).
 
 use super::fingerprint::INDEX_COLUMNS;
-use super::info::Info;
+use super::info::{Features, Info, Provenance};
 use super::schema::hex;
 use crate::error::{DatasetError, Result};
 use arrow_schema::DataType;
 use serde_json::Value;
 use sha2::{Digest, Sha256};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 /// Records in `info` the hash of everything else in it.
@@ -75,27 +75,45 @@ pub(super) fn info(root: &Path, value: &Value, info: &Info) -> Result<()> {
                 return bad("content", expected, found);
             }
         }
-        if provenance.demos.len() != info.total_episodes {
-            let expected = format!("an id for each of {} episodes", info.total_episodes);
-            return bad("actrm.demos", expected, provenance.demos.len().to_string());
-        }
-        for (name, episodes) in &provenance.masks {
-            if let Some(episode) = episodes.iter().find(|&&e| e >= info.total_episodes) {
-                let expected = format!("episodes below {}", info.total_episodes);
-                return bad(&format!("actrm.masks.{name}"), expected, episode.to_string());
-            }
-        }
     }
     if !(info.fps.is_finite() && info.fps > 0.0) {
         return bad("fps", "a number above 0".to_owned(), info.fps.to_string());
     }
-    for (name, feature) in &info.features.0 {
-        // paths are made of names
+    Ok(())
+}
+
+/// Refuses features that the file `path` states and no set can have. Paths are made of their names.
+pub(super) fn names(path: &Path, features: &Features) -> Result<()> {
+    let bad = |object: String, expected: &str, found: String| {
+        Err(DatasetError::BadDataset { path: path.to_path_buf(), object, expected: expected.to_owned(), found })
+    };
+    let mut known = BTreeSet::new();
+    for (name, feature) in &features.0 {
         if name.is_empty() || name.split('/').any(|part| part == "..") || name.starts_with('/') {
-            return bad("features", "names that stay inside the folder".to_owned(), format!("{name:?}"));
+            return bad("features".to_owned(), "names that stay inside the folder", format!("{name:?}"));
+        }
+        if !known.insert(name) {
+            return bad("features".to_owned(), "each name once", format!("{name} twice"));
         }
         if INDEX_COLUMNS.contains(&name.as_str()) && feature.dim() != 1 {
-            return bad(&format!("features.{name}.shape"), "[1]".to_owned(), format!("{:?}", feature.shape));
+            return bad(format!("features.{name}.shape"), "[1]", format!("{:?}", feature.shape));
+        }
+    }
+    Ok(())
+}
+
+/// Holds what is recorded of where a set came from against the episodes that there are.
+pub(super) fn origin(root: &Path, provenance: &Provenance, episodes: usize) -> Result<()> {
+    let bad = |object: &str, expected: String, found: usize| {
+        let (path, found) = (root.join("meta/info.json"), found.to_string());
+        Err(DatasetError::BadDataset { path, object: format!("actrm.{object}"), expected, found })
+    };
+    if provenance.demos.len() != episodes {
+        return bad("demos", format!("an id for each of {episodes} episodes"), provenance.demos.len());
+    }
+    for (name, named) in &provenance.masks {
+        if let Some(&episode) = named.iter().find(|&&episode| episode >= episodes) {
+            return bad(&format!("masks.{name}"), format!("episodes below {episodes}"), episode);
         }
     }
     Ok(())
@@ -163,7 +181,7 @@ pub(super) fn stored_as(path: &Path, name: &str, dtype: &str, column: &DataType)
 }
 
 /// Seconds that a time may be off, as LeRobot's `tolerance_s` has it.
-pub const TIME_TOLERANCE: f64 = 1e-4;
+pub const TIME_TOLERANCE: f64 = video::TOLERANCE;
 
 /// How far a frame's time is from its number in the episode over the rate, if that is more than `tolerance`.
 pub(super) fn time_off(time: f64, frame: usize, fps: f64, tolerance: f64) -> Option<f64> {

@@ -1,13 +1,14 @@
 //! Chooses the columns of the demos of a source, and notes what is taken for granted or left out.
 
+use super::check;
 use super::depth::{self, DepthKind};
 use super::encoded::{Files, may_hold_files};
 use super::features::{Column, ConvertOptions, IndexColumn, MISTAKE, Mapping, Origin};
 use super::info::{ActionKind, ActionProvenance, Feature, RotationForm};
-use super::to_robomimic::{Stated, stated};
+use super::to_robomimic::{Stated, in_statement, stated};
 use crate::error::{DatasetError, InputError, Result};
 use crate::keys::KeyItem;
-use crate::plan::{DemoPlan, Dialect, KeyPlan, Plan};
+use crate::plan::{DemoPlan, Dialect, KeyPlan, Plan, at_odds};
 use crate::tree::Dtype;
 use crate::words::{INSTRUCTION_WIDTH, INSTRUCTION_WORDS};
 use serde_json::{Value, json};
@@ -83,7 +84,13 @@ impl Chooser<'_> {
             notes: Vec::new(),
         };
         stated.mapping(self.plan, &mut mapping)?;
+        if !options.depth {
+            for column in mapping.columns.extract_if(.., |column| column.feature.is_depth()) {
+                mapping.notes.push(format!("{} becomes no column: no depth does (--no-depth)", column.name));
+            }
+        }
         mapping.columns.extend(index_columns());
+        check::names(&self.plan.path, &mapping.features()).map_err(in_statement)?;
         mapping.fps = self.checked(options.fps.unwrap_or(mapping.fps))?;
         self.filmed(&mut mapping, options)?;
         Ok(mapping)
@@ -383,7 +390,7 @@ impl Chooser<'_> {
             self.one_a_step("dones")?;
             columns.push(scalar("next.done", "bool", Origin::Flag("dones".to_owned())));
         }
-        if self.usual("rewards") && self.rewards_tell_success() {
+        if self.usual("rewards") && self.rewards_tell_success()? {
             columns.push(scalar("next.success", "bool", Origin::Success));
         } else if self.usual("success") {
             self.one_a_step("success")?;
@@ -403,9 +410,12 @@ impl Chooser<'_> {
 
     /// robosuite's sparse reward, and that of everything built on it, is 1 exactly when the task is solved; a shaped one tells
     /// nothing. LIBERO's own files say `reward_shaping`, but its tasks know no shaped reward.
-    fn rewards_tell_success(&self) -> bool {
+    fn rewards_tell_success(&self) -> Result<bool, InputError> {
+        if !self.is_robosuite() || self.plan.dialect == Dialect::Libero {
+            return Ok(self.is_robosuite());
+        }
         let shaped = self.env_kwargs().and_then(|kwargs| kwargs.get("reward_shaping")?.as_bool());
-        self.is_robosuite() && (shaped != Some(true) || self.plan.dialect == Dialect::Libero)
+        at_odds(&self.plan.problems, "reward_shaping").map_or(Ok(shaped != Some(true)), |error| Err(error.clone()))
     }
 
     fn env_kwargs(&self) -> Option<&Value> {
@@ -437,6 +447,9 @@ impl Chooser<'_> {
             }
             _ => None,
         };
+        if let (None, Some(error)) = (options.fps, at_odds(&self.plan.problems, "control_freq")) {
+            return Err(error.clone().into());
+        }
         // Isaac Lab states its steps
         let sim = self.plan.env_args.as_ref().and_then(|args| args.get("sim_args"));
         let step = sim.and_then(|sim| Some(sim.get("dt")?.as_f64()? * sim.get("decimation")?.as_f64()?));

@@ -46,7 +46,11 @@ pub(super) fn read_columns(
     let (mut late, mut unstated) = (Late::default(), BTreeSet::new());
     let (mut row, mut episode) = (0, 0);
     for path in read::files(root, "data")? {
-        for field in read::open(&path)?.schema().fields().iter().filter(|_| owned) {
+        let builder = read::open(&path)?;
+        if let Some(name) = info.features.in_data().find(|name| builder.schema().index_of(name).is_err()) {
+            return Err(read::missing_column(&path, &format!("{name}, which meta/info.json states"), &builder));
+        }
+        for field in builder.schema().fields().iter().filter(|_| owned) {
             if info.features.get(field.name()).is_none() {
                 unstated.insert(field.name().clone());
             }
@@ -131,8 +135,19 @@ pub(super) fn read_columns(
     Ok(())
 }
 
-/// The pieces of each numeric column, put together.
-pub(super) fn resident(info: &Info, pieces: Vec<Vec<Resident>>) -> BTreeMap<String, Resident> {
+/// [`read_columns`] that keeps each numeric column, its files put together.
+pub(super) fn resident(
+    root: &Path,
+    info: &Info,
+    episodes: &[EpisodeMeta],
+    owned: bool,
+    notes: &mut Vec<String>,
+) -> Result<BTreeMap<String, Resident>> {
+    let mut pieces: Vec<Vec<Resident>> = Vec::new();
+    read_columns(root, info, episodes, owned, None, notes, &mut |of_file| {
+        pieces.resize_with(of_file.len(), Vec::new);
+        pieces.iter_mut().zip(of_file).for_each(|(all, numbers)| all.push(numbers));
+    })?;
     let mut columns = BTreeMap::new();
     for ((name, feature), mut files) in numeric(info).zip(pieces) {
         let data = match files.len() {
@@ -141,7 +156,7 @@ pub(super) fn resident(info: &Info, pieces: Vec<Vec<Resident>>) -> BTreeMap<Stri
         };
         columns.insert(name.to_owned(), Resident { data, dim: feature.dim() });
     }
-    columns
+    Ok(columns)
 }
 
 /// The fingerprint of numeric columns that pass.

@@ -118,7 +118,7 @@ pub fn convert_unless(
     Ok(report)
 }
 
-struct StopWhenDropped<'a>(&'a AtomicBool);
+pub(super) struct StopWhenDropped<'a>(pub &'a AtomicBool);
 
 impl Drop for StopWhenDropped<'_> {
     fn drop(&mut self) {
@@ -143,11 +143,30 @@ pub(crate) fn without_observations(input: &Source) -> Result<()> {
     Err(InputError::NoObservations { path: plan.path.clone(), advice: plan.dialect.observe().to_owned() }.into())
 }
 
+/// What a file or folder is called, however it was named: `.` is the folder that it is.
+fn name_of(source: &Path) -> String {
+    let found = match source.file_name() {
+        Some(_) => None,
+        None => source.canonicalize().ok(),
+    };
+    found.as_deref().unwrap_or(source).file_name().unwrap_or_default().to_string_lossy().into_owned()
+}
+
+/// [`name_of`] without what says its format; what follows a dot in a folder's name belongs to it.
+fn name_without_ending(source: &Path) -> String {
+    let name = name_of(source);
+    let ending = Path::new(&name).extension().filter(|ending| source.is_file() || *ending == "zarr");
+    match ending {
+        Some(ending) => name[..name.len() - ending.len() - 1].to_owned(),
+        None => name,
+    }
+}
+
 /// Task texts in order of first use, and each episode's.
 pub(crate) fn tasks(source: &Path, plan: &Plan) -> (Vec<String>, Vec<usize>) {
     let (mut tasks, mut numbers): (Vec<String>, HashMap<&String, usize>) = Default::default();
     let mut task_of = Vec::with_capacity(plan.demos.len());
-    let stem = source.file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();
+    let stem = name_without_ending(source);
     for demo in &plan.demos {
         // no instruction: the environment names the task; a file that names none is known by its own name
         let text = demo.task.as_ref().or(plan.env_name.as_ref()).unwrap_or(&stem);
@@ -254,6 +273,7 @@ impl Opened {
             images: options.images,
             video: options.video.as_ref(),
             nonfinite: options.nonfinite,
+            lossless: options.lossless,
             encoder: &encoders.data,
             task_of: &head.task_of,
         };
@@ -329,7 +349,7 @@ impl Opened {
             actrm: Some(Provenance {
                 format: 1,
                 writer: CREATED_BY.to_owned(),
-                source: source.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default(),
+                source: name_of(source),
                 source_sha256: String::new(),
                 dialect: plan.dialect.name().to_owned(),
                 fingerprint: String::new(),
@@ -372,5 +392,27 @@ impl Opened {
             notes: plan.notes.iter().chain(&self.mapping.notes).cloned().collect(),
             last_notes: left_out_notes.into_iter().chain(problems).collect(),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    #[test]
+    fn a_source_has_its_own_name_however_it_is_named() {
+        let dir = tempfile::tempdir().unwrap();
+        for (name, expected) in [("pour.v2", "pour.v2"), ("push.zarr", "push"), ("plain", "plain")] {
+            let folder = dir.path().join(name);
+            std::fs::create_dir_all(folder.join("below")).unwrap();
+            for path in [folder.clone(), folder.join("."), folder.join("below/..")] {
+                assert_eq!(name_without_ending(&path), expected, "{}", path.display());
+            }
+        }
+        std::fs::write(dir.path().join("low_dim.hdf5"), "").unwrap();
+        assert_eq!(name_without_ending(&dir.path().join("low_dim.hdf5")), "low_dim");
+        let here = std::env::current_dir().unwrap();
+        assert_eq!(name_of(Path::new(".")), here.file_name().unwrap().to_string_lossy());
     }
 }

@@ -1,7 +1,7 @@
 //! Depth: a number a pixel, in metres or millimetres, a TIFF file a frame, as LeRobot writes and reads it.
 
 use super::export::Rows;
-use super::info::Feature;
+use super::info::{Feature, MAX_PIXELS, MAX_SIDE, is_picture};
 use super::open::Dataset;
 use super::tiff;
 use crate::error::{DatasetError, Result};
@@ -283,8 +283,12 @@ impl Dataset {
             return Err(bad("depth as images", found));
         }
         match feature.shape[..] {
-            [height, width, 1] if height > 0 && width > 0 => Ok((height, width)),
-            _ => Err(bad("depth of shape [height, width, 1]", format!("{:?}", feature.shape))),
+            [height, width, 1] if is_picture(height, width) => Ok((height, width)),
+            _ => {
+                let expected =
+                    format!("depth of shape [height, width, 1], up to {MAX_SIDE} on a side and {MAX_PIXELS} pixels");
+                Err(bad(&expected, format!("{:?}", feature.shape)))
+            }
         }
     }
 }

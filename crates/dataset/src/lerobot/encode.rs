@@ -10,6 +10,7 @@ use super::values::{Position, Values, episode_values};
 use super::videos::Camera;
 use super::work::{Part, is_bulk};
 use crate::error::{DatasetError, InputError, Result};
+use crate::plan::KeyPlan;
 use crate::source::{NonFinite, Source};
 use crate::stats::FeatureStats;
 use crate::tree::{Array, Demo};
@@ -32,6 +33,8 @@ pub(crate) struct Job<'a> {
     pub images: ImageForm,
     pub video: Option<&'a VideoOptions>,
     pub nonfinite: NonFinite,
+    /// Whether the side folder gets what becomes no column.
+    pub lossless: bool,
     pub encoder: &'a GroupEncoder,
     /// Task of each episode.
     pub task_of: &'a [usize],
@@ -93,8 +96,8 @@ impl Job<'_> {
         for part in parts {
             let plan = &self.source.plan().demos[part.episode];
             // what cannot be read and no column needs is no key of the plan
-            let small =
-                |key: &str| plan.keys.get(key).is_some_and(|k| needed.contains(key) || !is_bulk(k, plan.length));
+            let beside = |k: &KeyPlan| self.lossless && !is_bulk(k, plan.length);
+            let small = |key: &str| plan.keys.get(key).is_some_and(|k| needed.contains(key) || beside(k));
             let small = |key: &str| small(key) && !self.is_picture(key);
             let demo = self.source.read_demo_where(part.episode, &small)?;
             let position = Position {

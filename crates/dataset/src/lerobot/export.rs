@@ -112,7 +112,8 @@ pub fn export(
         progress(episode.to as u64, total);
     }
     writer.finish()?;
-    Ok(ExportReport { demos: episodes.len(), frames: info.total_frames, notes: Vec::new() })
+    let notes = to_robomimic::columns_of_others(root)?.into_iter().collect();
+    Ok(ExportReport { demos: episodes.len(), frames: info.total_frames, notes })
 }
 
 /// The layout of the side folder, once its files are known to be those that were written.
@@ -436,6 +437,8 @@ pub(crate) struct Rows {
     column: Option<String>,
     batch_rows: usize,
     reader: Option<(PathBuf, ParquetRecordBatchReader)>,
+    /// Rows of the files not yet opened that are passed over.
+    passed: usize,
     /// What is left of the batch that was read last.
     rest: Option<RecordBatch>,
 }
@@ -450,6 +453,7 @@ impl Rows {
             column: column.map(str::to_owned),
             batch_rows,
             reader: None,
+            passed: 0,
             rest: None,
         })
     }
@@ -469,11 +473,14 @@ impl Rows {
             let failed = |source| DatasetError::Parquet { path: path.clone(), operation: "read it", source };
             let mut builder = read::open(&path)?.with_batch_size(self.batch_rows);
             if let Some(column) = &self.column {
-                let index = builder.schema().index_of(column).map_err(|e| failed(e.into()))?;
+                let index = builder.schema().index_of(column).ok();
+                let index = index.ok_or_else(|| read::missing_column(&path, column, &builder))?;
                 let mask = ProjectionMask::roots(builder.parquet_schema(), [index]);
                 builder = builder.with_projection(mask);
             }
-            let reader = builder.build().map_err(failed)?;
+            let passed = self.passed.min(usize::try_from(builder.metadata().file_metadata().num_rows()).unwrap_or(0));
+            self.passed -= passed;
+            let reader = builder.with_offset(passed).build().map_err(failed)?;
             self.reader = Some((path, reader));
         }
     }
@@ -509,6 +516,10 @@ impl Rows {
     /// Passes over the next rows, with few of them in memory.
     pub(crate) fn skip(&mut self, rows: usize) -> Result<()> {
         let mut missing = rows;
+        if self.reader.is_none() {
+            // nothing is unpacked of what comes before the first row
+            self.passed += std::mem::take(&mut missing);
+        }
         while missing > 0 {
             missing -= self.next_rows(missing)?.num_rows();
         }

@@ -11,7 +11,7 @@ use crate::plan::Plan;
 use crate::source::NonFinite;
 use crate::tree::Dtype;
 use serde_json::json;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// What the names of columns of entities begin with.
 pub const ENTITY_PREFIX: &str = "observation.entity.";
@@ -196,6 +196,24 @@ impl Column {
     }
 }
 
+/// Numbers pictures whose datasets give one name, so that none takes the place of another.
+fn number_equal(columns: &mut [Column], notes: &mut Vec<String>) {
+    let mut taken: BTreeSet<String> = columns.iter().map(|column| column.name.clone()).collect();
+    let mut seen = BTreeSet::new();
+    for column in columns {
+        if seen.insert(column.name.clone()) {
+            continue;
+        }
+        let name = (2..).map(|n| format!("{}_{n}", column.name)).find(|name| !taken.contains(name));
+        let name = name.expect("some number is free");
+        if let Origin::Image { key, .. } | Origin::Depth { key, .. } = &column.origin {
+            notes.push(format!("{key} becomes {name}: another dataset has the name {}", column.name));
+        }
+        taken.insert(name.clone());
+        column.name = name;
+    }
+}
+
 /// The columns, and what was chosen on the way.
 #[derive(Debug, Clone)]
 pub(crate) struct Mapping {
@@ -248,6 +266,7 @@ impl Mapping {
         }
         let (mut pictures, mut left_out) = (chooser.images()?, BTreeMap::new());
         chooser.depth(options, &mut pictures, &mut left_out);
+        number_equal(&mut pictures, &mut notes);
         columns.extend(pictures);
         notes.extend(chooser.pictures_left_out(&columns, left_out, options));
         let (action, provenance) = chooser.action(options)?;

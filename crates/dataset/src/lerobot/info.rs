@@ -106,6 +106,12 @@ pub struct Feature {
 pub(crate) const MAX_SIDE: usize = 8192;
 pub(crate) const MAX_PIXELS: usize = 1 << 24;
 
+/// Whether a picture can have this size.
+pub(crate) fn is_picture(height: usize, width: usize) -> bool {
+    let sides = 1..=MAX_SIDE;
+    sides.contains(&height) && sides.contains(&width) && height * width <= MAX_PIXELS
+}
+
 impl Feature {
     /// Number of values in one frame.
     pub fn dim(&self) -> usize {
@@ -149,8 +155,7 @@ impl Feature {
             [height, width, 3] if !channels_first => (height, width),
             _ => return None,
         };
-        let sides = 1..=MAX_SIDE;
-        (sides.contains(&height) && sides.contains(&width) && height * width <= MAX_PIXELS).then_some((height, width))
+        is_picture(height, width).then_some((height, width))
     }
 
     /// Whether the pictures are depth: one number a pixel, no colours.
@@ -193,6 +198,11 @@ impl Features {
     /// Names in order.
     pub fn names(&self) -> impl Iterator<Item = &str> {
         self.0.iter().map(|(n, _)| n.as_str())
+    }
+
+    /// Names of those that the data files have columns of: all but videos.
+    pub(crate) fn in_data(&self) -> impl Iterator<Item = &str> {
+        self.0.iter().filter(|(_, f)| f.dtype != "video").map(|(name, _)| name.as_str())
     }
 }
 

@@ -82,7 +82,15 @@ pub(crate) fn write_episodes(
     // a camera has its places whether or not somebody counted its pictures
     let filmed = rows.first().into_iter().flat_map(|row| row.videos.keys());
     let filmed: Vec<&String> = filmed.filter(|&name| rows.iter().all(|row| row.videos.contains_key(name))).collect();
-    let counted: Vec<&(String, bool)> = features.iter().filter(|(name, _)| stats.all_have(name)).collect();
+    // quantiles, which sets of earlier versions lack, are columns where every episode has them
+    let stored = |name: &str| -> Vec<Getter> {
+        STATISTICS.into_iter().zip(stats.lacks(name)).filter(|(_, lacks)| !lacks).map(|(one, _)| one).collect()
+    };
+    let counted: Vec<Stored<'_>> = features
+        .iter()
+        .filter(|(name, _)| stats.all_have(name))
+        .map(|(name, is_image)| (name.as_str(), *is_image, stored(name)))
+        .collect();
     let mut groups = rows.chunks(EpisodeStats::GROUP).enumerate().map(|(group, part)| {
         let start = group * EpisodeStats::GROUP;
         let mut columns = episode_columns(start, tasks, &filmed, &counted, part, &stats.group(group)?);
@@ -105,7 +113,7 @@ fn episode_columns(
     start: usize,
     tasks: &[String],
     filmed: &[&String],
-    counted: &[&(String, bool)],
+    counted: &[Stored<'_>],
     rows: &[EpisodeRow],
     stats: &[BTreeMap<String, FeatureStats>],
 ) -> Vec<(String, ArrayRef)> {
@@ -138,11 +146,9 @@ fn episode_columns(
             (format!("videos/{name}/to_timestamp"), seconds(&|s| s.to)),
         ]);
     }
-    for (feature, is_image) in counted {
-        let each = || stats.iter().map(|of_episode| of_episode.get(feature));
-        // sets written before quantiles were stored have none
-        let stored = |get: fn(&FeatureStats) -> &Vec<f64>| !each().flatten().any(|stats| get(stats).is_empty());
-        for (name, get) in STATISTICS.into_iter().filter(|(_, get)| stored(*get)) {
+    for (feature, is_image, stored) in counted {
+        let each = || stats.iter().map(|of_episode| of_episode.get(*feature));
+        for (name, get) in stored {
             let mut values = Float64Builder::new();
             let mut lengths = Vec::with_capacity(rows.len());
             for of_episode in each() {
@@ -170,7 +176,10 @@ fn episode_columns(
 /// A statistic's name and where it is.
 type Getter = (&'static str, fn(&FeatureStats) -> &Vec<f64>);
 
-/// The statistics that are vectors.
+/// A feature, whether it is an image, and its statistics that are columns.
+type Stored<'n> = (&'n str, bool, Vec<Getter>);
+
+/// The statistics that are vectors, in the order of [`FeatureStats::vectors`].
 const STATISTICS: [Getter; 9] = [
     ("min", |s| &s.min),
     ("max", |s| &s.max),
@@ -338,6 +347,27 @@ fn flatten(value: &Value, out: &mut Vec<f64>) -> Result<(), String> {
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
+
+    #[test]
+    fn quantiles_are_columns_where_every_episode_has_them() {
+        let (episodes, place) = (EpisodeStats::GROUP + 1, Place { folder: 0, file: 0 });
+        let row = |from| EpisodeRow { length: 1, from, tasks: vec![0], place, videos: BTreeMap::new() };
+        let rows: Vec<EpisodeRow> = (0..episodes).map(row).collect();
+        let whole = FeatureStats::of(&[0.5_f64], 1).unwrap();
+        let bare = FeatureStats { q01: Vec::new(), ..whole.clone() };
+        for lacking in [0, episodes - 1, episodes] {
+            let folder = tempfile::tempdir().unwrap();
+            let mut each = EpisodeStats::new(folder.path());
+            for episode in 0..episodes {
+                let stats = if episode == lacking { &bare } else { &whole };
+                each.add(&BTreeMap::from([("x".to_owned(), stats.clone())]), 1).unwrap();
+            }
+            write_episodes(folder.path(), &["t".to_owned()], &[("x".to_owned(), true)], &rows, &each, &[]).unwrap();
+            let file = crate::lerobot::read::open(&folder.path().join(EPISODES_FILE)).unwrap();
+            let has = |name: &str| file.schema().index_of(&format!("stats/x/{name}")).is_ok();
+            assert_eq!(["mean", "q01", "q99"].map(has), [true, lacking == episodes, true]);
+        }
+    }
 
     #[test]
     fn statistics_are_read_to_the_last_bit() {

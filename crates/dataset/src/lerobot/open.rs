@@ -126,12 +126,7 @@ impl Dataset {
     /// LeRobot reads it and named in [`Dataset::notes`].
     pub fn open(root: &Path) -> Result<Self> {
         let (mut dataset, mut notes) = Self::open_tables(root)?;
-        let mut pieces: Vec<Vec<Resident>> = Vec::new();
-        read_columns(root, &dataset.info, &dataset.episodes, true, None, &mut notes, &mut |of_file| {
-            pieces.resize_with(of_file.len(), Vec::new);
-            pieces.iter_mut().zip(of_file).for_each(|(all, numbers)| all.push(numbers));
-        })?;
-        dataset.columns = resident(&dataset.info, pieces);
+        dataset.columns = resident(root, &dataset.info, &dataset.episodes, true, &mut notes)?;
         dataset.complete(notes, |set| set.content_fingerprint())
     }
 
@@ -159,6 +154,9 @@ impl Dataset {
         let table = read_tasks(root, &info)?;
         let episodes = read_episodes(root, &info)?;
         correct_totals(&mut info, &episodes, table.texts.len(), &mut notes);
+        if let Some(provenance) = &info.actrm {
+            check::origin(root, provenance, episodes.len())?;
+        }
         check::leave_out_stale_splits(&mut info, &mut notes);
         let (task_numbers, tasks) = table.read_as(root, &episodes, &mut notes)?;
         let dataset = Self::of(root, info, episodes, (task_numbers, tasks), BTreeMap::new(), Vec::new())?;
@@ -182,12 +180,7 @@ impl Dataset {
         table_rows: Option<Vec<usize>>,
     ) -> Result<Self> {
         let mut notes = Vec::new();
-        let mut pieces: Vec<Vec<Resident>> = Vec::new();
-        read_columns(root, &info, &episodes, false, None, &mut notes, &mut |of_file| {
-            pieces.resize_with(of_file.len(), Vec::new);
-            pieces.iter_mut().zip(of_file).for_each(|(all, numbers)| all.push(numbers));
-        })?;
-        let columns = resident(&info, pieces);
+        let columns = resident(root, &info, &episodes, false, &mut notes)?;
         let mut dataset = Self::of(root, info, episodes, tasks, columns, notes)?;
         dataset.table_rows = table_rows;
         dataset.fingerprint = dataset.content_fingerprint();
@@ -628,6 +621,7 @@ pub(crate) fn parse_info(root: &Path) -> Result<(Info, Value)> {
         info.actrm = Some(serde_json::from_slice(&text).map_err(failed(&beside))?);
         value["actrm"] = serde_json::from_slice(&text).map_err(failed(&beside))?;
     }
+    check::names(&path, &info.features)?;
     Ok((info, value))
 }
 
@@ -707,8 +701,10 @@ impl TaskTable {
             let mut distinct = frames.to_vec();
             distinct.sort_unstable();
             distinct.dedup();
+            // both tables are in the order of their numbers
             let agree = |table: &[(i64, &String)]| {
-                let text = |number: i64| table.iter().find(|(n, _)| *n == number).map(|(_, text)| *text);
+                let row = |number: i64| table.get(table.partition_point(|(n, _)| *n < number));
+                let text = |number: i64| row(number).filter(|(n, _)| *n == number).map(|(_, text)| *text);
                 distinct.iter().all(|&number| text(number).is_some_and(|text| texts.contains(text)))
             };
             rows += usize::from(agree(&by_row));

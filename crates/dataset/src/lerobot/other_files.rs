@@ -1,5 +1,6 @@
 //! What lies in the folder of a data set and is no part of it: a README, a `.git`, tables of other programs.
 
+use super::v2::version as old_version;
 use crate::error::{DatasetError, Result};
 use std::fs::File;
 use std::io;
@@ -7,15 +8,15 @@ use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
 
 /// Their paths in the folder, sorted; of a folder that holds no part of the set its own alone. `images` counts as one: frames may
-/// name files in it, which edits put into the tables.
+/// name files in it, which edits put into the tables. The folder may be one of LeRobot v2.x.
 pub(super) fn other_files(root: &Path) -> Result<Vec<PathBuf>> {
     let mut found = Vec::new();
-    look(root, Path::new(""), &mut found)?;
+    look(root, old_version(root).is_some(), Path::new(""), &mut found)?;
     found.sort();
     Ok(found)
 }
 
-fn look(root: &Path, below: &Path, found: &mut Vec<PathBuf>) -> Result<()> {
+fn look(root: &Path, old: bool, below: &Path, found: &mut Vec<PathBuf>) -> Result<()> {
     let folder = root.join(below);
     let failed = |source| DatasetError::Io { path: folder.clone(), operation: "list it", source };
     for entry in std::fs::read_dir(&folder).map_err(failed)? {
@@ -25,6 +26,7 @@ fn look(root: &Path, below: &Path, found: &mut Vec<PathBuf>) -> Result<()> {
         let names: Option<Vec<&str>> = path.iter().map(|name| name.to_str()).collect();
         let part = match names.as_deref() {
             Some(["actrm"] | ["meta", "info.json" | "stats.json" | "tasks.parquet"]) => true,
+            Some(["meta", "tasks.jsonl" | "episodes.jsonl" | "episodes_stats.jsonl"]) => old,
             Some(["meta", "episodes", _, file] | ["data", _, file]) => file.ends_with(".parquet"),
             Some(["videos", _, _, file]) => file.ends_with(".mp4"),
             _ => false,
@@ -41,7 +43,7 @@ fn look(root: &Path, below: &Path, found: &mut Vec<PathBuf>) -> Result<()> {
         );
         // what a link names, too
         if looked_into && std::fs::metadata(entry.path()).is_ok_and(|found| found.is_dir()) {
-            look(root, &path, found)?;
+            look(root, old, &path, found)?;
         } else if !part {
             found.push(path);
         }

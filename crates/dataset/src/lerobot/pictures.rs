@@ -1,5 +1,6 @@
 //! Pictures of an opened data set: image columns and videos, decoded into bytes in memory.
 
+use super::check::TIME_TOLERANCE;
 use super::export::Rows;
 use super::images;
 use super::info::{Feature, Info, MAX_PIXELS, MAX_SIDE};
@@ -20,8 +21,6 @@ use std::sync::Arc;
 
 /// Pictures that are unpacked from a column at once.
 const ROWS: usize = 256;
-/// LeRobot's tolerance for the time of a frame, in seconds.
-const TOLERANCE: f64 = 1e-4;
 
 /// All pictures of one camera, a picture a frame of the data set, in its order.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -340,9 +339,7 @@ impl Dataset {
         let size = height * width * 3;
         let mut rows = Rows::open(self.root(), "data", Some(name), ROWS)?;
         let before: usize = self.episodes()[..episodes.start].iter().map(|e| e.length).sum();
-        for from in (0..before).step_by(ROWS) {
-            rows.take(ROWS.min(before - from))?;
-        }
+        rows.skip(before)?;
         let frames: usize = self.episodes()[episodes].iter().map(|e| e.length).sum();
         let mut buffer = vec![0; ROWS.min(frames) * size];
         for from in (0..frames).step_by(ROWS) {
@@ -525,7 +522,6 @@ impl Film {
     /// Gives the pictures of an episode to `take`, one by one.
     pub fn each(&mut self, episode: &EpisodeMeta, place: &VideoPlace, take: &mut dyn FnMut(&[u8])) -> Result<()> {
         let size = self.size.0 * self.size.1 * 3;
-        self.locate(episode, place)?;
         self.blocks(episode, place, (PIECE / size).max(1), &mut |block| {
             block.chunks_exact(size).for_each(&mut *take);
             Ok(())
@@ -560,15 +556,15 @@ impl Film {
         let last = info.seconds(info.frames.saturating_sub(1)).unwrap_or(0.0);
         let first = info.frame_at(place.from).ok_or_else(|| {
             let found = format!("{} frames up to {last} s", info.frames);
-            bad(what(0), format!("a frame within {TOLERANCE} s of {} s", place.from), found)
+            bad(what(0), format!("a frame within {TIME_TOLERANCE} s of {} s", place.from), found)
         })?;
         for i in 0..episode.length {
             let due = place.from + i as f64 / self.fps;
             match info.seconds(first + i) {
-                Some(shown) if (shown - due).abs() <= TOLERANCE => {}
+                Some(shown) if (shown - due).abs() <= TIME_TOLERANCE => {}
                 shown => {
                     let found = shown.map_or_else(|| format!("the end after {last} s"), |s| format!("one at {s} s"));
-                    return Err(bad(what(i), format!("a frame within {TOLERANCE} s of {due} s"), found));
+                    return Err(bad(what(i), format!("a frame within {TIME_TOLERANCE} s of {due} s"), found));
                 }
             }
         }

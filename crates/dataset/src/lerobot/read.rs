@@ -134,7 +134,7 @@ fn bad_count(path: &Path, rows: i64) -> DatasetError {
     }
 }
 
-fn missing_column(path: &Path, name: &str, builder: &ParquetRecordBatchReaderBuilder<File>) -> DatasetError {
+pub(crate) fn missing_column(path: &Path, name: &str, builder: &ParquetRecordBatchReaderBuilder<File>) -> DatasetError {
     let names: Vec<&str> = builder.schema().fields().iter().map(|f| f.name().as_str()).collect();
     DatasetError::NotInDataset { path: path.to_path_buf(), wanted: format!("column {name}"), found: names.join(", ") }
 }

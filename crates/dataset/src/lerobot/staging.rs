@@ -95,7 +95,10 @@ impl Staging {
                 _ => {}
             }
             if folder.path().exists() {
-                widen_permissions(folder.path())?;
+                // one that replaces another gets those of that one in the end
+                if !replaces {
+                    widen_permissions(folder.path())?;
+                }
                 let path = folder.keep();
                 return Ok(Self { path, target: target.to_path_buf(), _lock: lock, replaces, published: false });
             }
@@ -128,6 +131,9 @@ impl Staging {
 
     fn exchange(&self) -> Result<()> {
         other_files::carry_over(&self.target, &self.path)?;
+        std::fs::metadata(&self.target)
+            .and_then(|target| std::fs::set_permissions(&self.path, target.permissions()))
+            .map_err(io_error(&self.target, "keep its permissions"))?;
         // at once: at no time is there neither of the two; dropped then, the hidden folder is the old one
         renameat_with(CWD, &self.path, CWD, &self.target, RenameFlags::EXCHANGE)
             .map_err(|errno| io_error(&self.target, "exchange it with what was written beside it")(errno.into()))
@@ -335,6 +341,8 @@ mod tests {
             std::fs::create_dir_all(target.join(kept).parent().unwrap()).unwrap();
             std::fs::write(target.join(kept), kept).unwrap();
         }
+        let private = std::os::unix::fs::PermissionsExt::from_mode(0o750);
+        std::fs::set_permissions(&target, private).unwrap();
         std::os::unix::fs::symlink("README.md", target.join("LIESMICH")).unwrap();
         std::os::unix::fs::symlink(&target, &link).unwrap();
         drop(Staging::replacing(&target).unwrap());
@@ -343,6 +351,8 @@ mod tests {
         std::fs::write(staging.path().join("data/chunk-000/y.parquet"), "new").unwrap();
         assert_eq!(std::fs::read_to_string(target.join("data/chunk-000/x.parquet")).unwrap(), "old");
         staging.publish().unwrap();
+        let mode = std::os::unix::fs::PermissionsExt::mode(&std::fs::metadata(&target).unwrap().permissions());
+        assert_eq!(mode & 0o777, 0o750);
         assert_eq!(names(&target.join("data")), ["chunk-000", "extra.parquet", "notes.txt"]);
         assert_eq!(names(&target.join("data/chunk-000")), ["y.parquet"]);
         // what is no part of a data set stays as it was

@@ -14,7 +14,7 @@ use super::open::{Dataset, EpisodeMeta, TaskTable, parse_info};
 use super::read;
 use crate::error::{DatasetError, Result};
 use serde_json::{Value, json};
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
 /// A row of `meta/episodes`.
@@ -59,6 +59,8 @@ pub(super) struct Tables {
     files: Vec<DataFile>,
     /// Columns of the files that are no features, each with the first file that has it.
     unstated: BTreeMap<String, String>,
+    /// Features that a file has no column of, each with the first such file.
+    lacking: BTreeMap<String, String>,
     frames: usize,
     /// The columns that number frames, as far as the files have them.
     numbers: BTreeMap<String, Vec<i64>>,
@@ -93,6 +95,7 @@ impl Tables {
             number_of: BTreeMap::new(),
             files: Vec::new(),
             unstated: BTreeMap::new(),
+            lacking: BTreeMap::new(),
             frames: 0,
             numbers: BTreeMap::new(),
             times: None,
@@ -110,10 +113,15 @@ impl Tables {
         let mut numbers: BTreeMap<&str, Vec<i64>> = NUMBERS.into_iter().map(|name| (name, Vec::new())).collect();
         for path in read::files(&self.root, "data")? {
             let (rows, arrays) = read::columns_there(&path, &wanted)?;
-            for field in read::open(&path)?.schema().fields() {
+            let file = relative(&self.root, &path);
+            let builder = read::open(&path)?;
+            for field in builder.schema().fields() {
                 if self.info.features.get(field.name()).is_none() {
-                    self.unstated.entry(field.name().clone()).or_insert_with(|| relative(&self.root, &path));
+                    self.unstated.entry(field.name().clone()).or_insert_with(|| file.clone());
                 }
+            }
+            for name in self.info.features.in_data().filter(|name| builder.schema().index_of(name).is_err()) {
+                self.lacking.entry(name.to_owned()).or_insert_with(|| file.clone());
             }
             for name in NUMBERS {
                 match (arrays.get(name), numbers.get_mut(name)) {
@@ -128,7 +136,7 @@ impl Tables {
                 }
                 _ => None,
             };
-            self.files.push(DataFile { relative: relative(&self.root, &path), first: self.frames, rows });
+            self.files.push(DataFile { relative: file, first: self.frames, rows });
             self.frames += rows;
         }
         self.numbers = numbers.into_iter().map(|(name, all)| (name.to_owned(), all)).collect();
@@ -215,7 +223,9 @@ impl Tables {
                 .meant(each.clone().map(|((&first, &length), &row)| (said(row).as_slice(), numbers(first, length)))),
             None => Default::default(),
         };
-        let text = |number: i64| meant.0.iter().position(|&n| n == number).map(|at| &meant.1[at]);
+        // the first of two tasks of one number counts
+        let text_of: HashMap<i64, &String> = meant.0.iter().copied().zip(&meant.1).rev().collect();
+        let known: HashSet<&String> = meant.1.iter().collect();
         let mut episodes = Vec::with_capacity(lengths.len());
         for (number, ((&first, &length), &row)) in each.enumerate() {
             let said = said(row);
@@ -225,9 +235,9 @@ impl Tables {
                     counted.push(number);
                 }
             }
-            let of_frames: Option<Vec<&String>> = counted.iter().map(|&number| text(number)).collect();
+            let of_frames: Option<Vec<&String>> = counted.iter().map(|number| text_of.get(number).copied()).collect();
             let of_frames = of_frames.unwrap_or_default();
-            let frames_know = of_frames.len() > 1 || said.is_empty() || said.iter().any(|text| !meant.1.contains(text));
+            let frames_know = of_frames.len() > 1 || said.is_empty() || said.iter().any(|text| !known.contains(text));
             // what was written with the episode, unless its frames differ or the table does not know it
             let tasks = if same(&of_frames, said) || length == 0 {
                 said.clone()
@@ -303,7 +313,8 @@ impl Tables {
         let mut numbers = self.meant.0.clone();
         let mut kept = self.meant.1.clone();
         // texts that the table lacks have no number in any frame
-        for text in self.texts.iter().filter(|text| !self.meant.1.contains(text)) {
+        let known: HashSet<&String> = self.meant.1.iter().collect();
+        for text in self.texts.iter().filter(|text| !known.contains(text)) {
             numbers.push(i64::MIN);
             kept.push(text.clone());
         }

@@ -3,6 +3,7 @@
 
 use super::convert::without_observations;
 use super::depth::DepthKind;
+use super::edit;
 use super::encoded;
 use super::export::{ExportReport, Rows, each_file, picture_pixels};
 use super::features::{Column, Mapping, Origin};
@@ -10,7 +11,7 @@ use super::fingerprint::INDEX_COLUMNS;
 use super::images;
 use super::info::{Feature, Info};
 use super::open::{Dataset, EpisodeMeta};
-use super::read::{BadColumn, cast_all, leaf, texts};
+use super::read::{self, BadColumn, cast_all, leaf, texts};
 use super::skip;
 use super::tiff;
 use crate::error::{DatasetError, InputError, Result};
@@ -167,6 +168,7 @@ pub(super) fn from_columns(
         set.episodes().iter().map(|e| e.demo.clone().unwrap_or_else(|| format!("demo_{}", e.index))).collect();
     let empty: Vec<&str> =
         set.episodes().iter().zip(&ids).filter(|(e, _)| e.length == 0).map(|(_, id)| &**id).collect();
+    notes.extend(columns_of_others(root)?);
     if !empty.is_empty() {
         notes.push(format!("episodes without frames become demos without steps: {}", list(empty.into_iter())));
     }
@@ -202,6 +204,18 @@ pub(super) fn from_columns(
     }
     writer.finish()?;
     Ok(ExportReport { demos: ids.len(), frames: set.frames(), notes })
+}
+
+/// A note of what other programs say of the episodes.
+pub(super) fn columns_of_others(root: &Path) -> Result<Option<String>> {
+    let mut names = BTreeSet::new();
+    for path in read::files(root, "meta/episodes")? {
+        let builder = read::open(&path)?;
+        names.extend(builder.schema().fields().iter().map(|f| f.name().clone()).filter(|name| !edit::is_own(name)));
+    }
+    let found = || list(names.iter().map(String::as_str));
+    Ok((!names.is_empty())
+        .then(|| format!("columns of meta/episodes that have no place in a robomimic file are left out: {}", found())))
 }
 
 /// Arguments of an environment that robomimic accepts.
@@ -313,6 +327,17 @@ fn episode_array(
 /// The columns that a file states, where it was made of a data set.
 pub(crate) fn stated(plan: &Plan) -> Option<Stated> {
     serde_json::from_str(plan.texts.get(&format!("data/{STATED}"))?).ok()
+}
+
+/// What is wrong with the columns that a file states, as an error of that file.
+pub(super) fn in_statement(error: DatasetError) -> DatasetError {
+    match error {
+        DatasetError::BadDataset { path, object, expected, found } => {
+            let (of, attribute) = ("data".to_owned(), format!("{STATED}: {object}"));
+            InputError::BadAttribute { path, object: of, attribute, expected, found }.into()
+        }
+        other => other,
+    }
 }
 
 impl Stated {

@@ -146,11 +146,20 @@ fn taken<T: Sample>(values: &mut Vec<T>, dim: usize) -> (Vec<u8>, usize) {
     (bytes, rows)
 }
 
+/// A feature that episodes have statistics of.
+struct Counted {
+    name: String,
+    /// How many do.
+    episodes: usize,
+    /// Which of [`FeatureStats::vectors`] one of them lacks.
+    lacks: [bool; 9],
+}
+
 /// The statistics of each episode's features.
 pub(crate) struct EpisodeStats {
     spill: Spill,
-    /// Names of the features that any episode has statistics of, and of how many episodes.
-    names: Vec<(String, usize)>,
+    /// The features that any episode has statistics of.
+    features: Vec<Counted>,
     /// Place and length of the statistics of each group of episodes.
     groups: Vec<(u64, usize)>,
     waiting: Vec<u8>,
@@ -164,8 +173,8 @@ impl EpisodeStats {
     pub(crate) const GROUP: usize = 1000;
 
     pub(crate) fn new(folder: &Path) -> Self {
-        let (names, groups, waiting) = (Vec::new(), Vec::new(), Vec::new());
-        Self { spill: Spill::new(folder), names, groups, waiting, episodes: 0, empty: 0 }
+        let (features, groups, waiting) = (Vec::new(), Vec::new(), Vec::new());
+        Self { spill: Spill::new(folder), features, groups, waiting, episodes: 0, empty: 0 }
     }
 
     /// Takes those of the next episode, of so many frames.
@@ -175,14 +184,16 @@ impl EpisodeStats {
         self.empty += usize::from(frames == 0);
         put(&mut self.waiting, stats.len() as u64);
         for (name, stats) in stats {
-            let at = self.names.iter().position(|(known, _)| known == name).unwrap_or_else(|| {
-                self.names.push((name.clone(), 0));
-                self.names.len() - 1
+            let at = self.features.iter().position(|known| known.name == *name).unwrap_or_else(|| {
+                self.features.push(Counted { name: name.clone(), episodes: 0, lacks: [false; 9] });
+                self.features.len() - 1
             });
-            self.names[at].1 += 1;
+            let counted = &mut self.features[at];
+            counted.episodes += 1;
             put(&mut self.waiting, at as u64);
             put(&mut self.waiting, stats.count);
-            for vector in stats.vectors() {
+            for (vector, lacks) in stats.vectors().into_iter().zip(&mut counted.lacks) {
+                *lacks |= vector.is_empty();
                 put(&mut self.waiting, vector.len() as u64);
                 vector.iter().for_each(|value| put(&mut self.waiting, value.to_bits()));
             }
@@ -198,7 +209,16 @@ impl EpisodeStats {
 
     /// Whether every episode that has frames has statistics of a feature.
     pub(crate) fn all_have(&self, feature: &str) -> bool {
-        self.names.iter().any(|(name, episodes)| name == feature && *episodes == self.episodes - self.empty)
+        self.of(feature).is_some_and(|counted| counted.episodes == self.episodes - self.empty)
+    }
+
+    /// Which of [`FeatureStats::vectors`] an episode with statistics of a feature lacks.
+    pub(crate) fn lacks(&self, feature: &str) -> [bool; 9] {
+        self.of(feature).map_or([true; 9], |counted| counted.lacks)
+    }
+
+    fn of(&self, feature: &str) -> Option<&Counted> {
+        self.features.iter().find(|counted| counted.name == feature)
     }
 
     /// Whether an episode has none.
@@ -227,7 +247,7 @@ impl EpisodeStats {
         for _ in first..self.episodes.min(first + Self::GROUP) {
             let mut of_episode = BTreeMap::new();
             for _ in 0..next() {
-                let (name, _) = &self.names[next() as usize];
+                let name = &self.features[next() as usize].name;
                 let count = next();
                 let mut vector = || (0..next()).map(|_| f64::from_bits(next())).collect::<Vec<f64>>();
                 of_episode.insert(name.clone(), FeatureStats::from_vectors(count, std::array::from_fn(|_| vector())));

@@ -1,12 +1,13 @@
 //! LeRobot v2.0 and v2.1 folders, which have a file an episode: shown as the v3.0 set that they become, by links to their files
 //! beside tables of v3.0. Conversion composes its result from that view, as `edit` does.
 
+use super::check;
 use super::convert::ConvertReport;
 use super::edit;
 use super::features::{ConvertOptions, ImageForm};
 use super::info::{ActionKind, CODEBASE_VERSION, DATA_PATH, FILES_PER_FOLDER, Info, RotationForm};
 use super::meta::{self, EpisodeRow, parse_stats, python_json};
-use super::open::{Dataset, read_file};
+use super::open::{Dataset, read_file, read_info};
 use super::read;
 use super::shards::Place;
 use super::staging::own;
@@ -177,15 +178,14 @@ impl OldSet {
         }
         let Self { root, version, view, mut set, notes } = self;
         set.limit_files(options.data_file_mb, options.video_file_mb);
-        let report = edit::gather(set, out, progress).map_err(|error| named(error, view.path(), &root))?;
-        let set = Dataset::open(out)?;
-        let features = &set.info().features.0;
+        let report = edit::gather(set, &root, out, progress).map_err(|error| named(error, view.path(), &root))?;
+        let features = read_info(out)?.features.0;
         Ok(ConvertReport {
             dialect: if version == "v2.0" { "LeRobot v2.0" } else { "LeRobot v2.1" },
             episodes: report.episodes,
             frames: report.frames,
             tasks: report.tasks,
-            features: features.iter().map(|(name, f)| (name.clone(), f.dtype.clone(), f.shape.clone())).collect(),
+            features: features.into_iter().map(|(name, f)| (name, f.dtype, f.shape)).collect(),
             files: report.files,
             bytes: report.bytes,
             fingerprint: report.fingerprint,
@@ -225,6 +225,7 @@ fn show(root: &Path, view: &Path, notes: &mut Vec<String>) -> Result<()> {
     let path = root.join("meta/info.json");
     let mut info: Info = serde_json::from_slice(&read_file(&path)?)
         .map_err(|source| DatasetError::Json { path: path.clone(), source })?;
+    check::names(&path, &info.features)?;
     let tasks =
         in_order(root, "tasks.jsonl", lines(root, "tasks.jsonl", "task_index and task")?, |line: &TaskLine| {
             line.task_index
@@ -244,7 +245,7 @@ fn show(root: &Path, view: &Path, notes: &mut Vec<String>) -> Result<()> {
     let bad_path = |object: &str, found: String| DatasetError::BadDataset {
         path: path.clone(),
         object: object.to_owned(),
-        expected: "a path inside the folder with episode_chunk and episode_index".to_owned(),
+        expected: "a path inside the folder with episode_chunk and episode_index, of videos with video_key".to_owned(),
         found,
     };
     let mut rows = Vec::with_capacity(episodes.len());
@@ -274,7 +275,8 @@ fn show(root: &Path, view: &Path, notes: &mut Vec<String>) -> Result<()> {
         let mut videos = BTreeMap::new();
         for camera in &cameras {
             let template = info.video_path.clone().unwrap_or_default();
-            let relative = fill(&template, camera, chunk, number).ok_or_else(|| bad_path("video_path", template))?;
+            let relative = fill(&template, camera, chunk, number).filter(|_| template.contains("{video_key}"));
+            let relative = relative.ok_or_else(|| bad_path("video_path", template))?;
             let file = root.join(relative);
             read::refuse_pointer(&file)?;
             link(&file, &view.join("videos").join(camera).join(numbered(number, "mp4")))?;

@@ -25,7 +25,8 @@ pub(crate) fn hash_file(path: &Path) -> Result<String> {
     hash_file_unless(path, &AtomicBool::new(false))
 }
 
-fn hash_file_unless(path: &Path, stop: &AtomicBool) -> Result<String> {
+/// [`hash_file`], unless it is stopped meanwhile.
+pub(crate) fn hash_file_unless(path: &Path, stop: &AtomicBool) -> Result<String> {
     let failed = |source| DatasetError::Io { path: path.to_path_buf(), operation: "read it", source };
     let mut file = File::open(path).map_err(failed)?;
     let mut hash = Sha256::new();

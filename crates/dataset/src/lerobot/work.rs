@@ -6,7 +6,7 @@ use crate::plan::{DemoPlan, KeyPlan};
 use crate::tree::Dtype;
 use std::collections::BTreeMap;
 use std::ops::Range;
-use std::sync::{Condvar, Mutex, mpsc};
+use std::sync::{Condvar, Mutex, PoisonError, mpsc};
 
 /// Frames after which a row group of whole episodes is closed: setting up a column costs as much as packing some
 /// hundred frames of it, and a reader of one episode unpacks no more than this many frames.
@@ -69,13 +69,13 @@ pub(crate) fn cut(demos: &[DemoPlan], mapping: &Mapping, lossless: bool, file_by
     for (episode, demo) in demos.iter().enumerate() {
         let mut block = 1;
         let per_row: u64 = match lossless {
-            true => demo.keys.values().map(row_bytes).sum(),
+            true => demo.keys.values().map(row_bytes).fold(0, u64::saturating_add),
             false => mapping.image_bytes_per_frame() as u64,
         };
         for key in demo.keys.values().filter(|key| is_bulk(key, demo.length)) {
             block = block.max(key.block_rows);
         }
-        let total = per_row * demo.length as u64;
+        let total = per_row.saturating_mul(demo.length as u64);
         let part = |rows| Part { episode, length: demo.length, first_frame, rows };
         if total > GROUP_BYTES {
             if !open.is_empty() {
@@ -113,6 +113,18 @@ struct Turn {
     stopped: bool,
 }
 
+/// Tells the other threads to stop where this one panics: none waits for a result that never comes.
+struct StopOnPanic<'t>(&'t Mutex<Turn>, &'t Condvar);
+
+impl Drop for StopOnPanic<'_> {
+    fn drop(&mut self) {
+        if std::thread::panicking() {
+            self.0.lock().unwrap_or_else(PoisonError::into_inner).stopped = true;
+            self.1.notify_all();
+        }
+    }
+}
+
 /// Does `count` pieces of work on `jobs` threads and hands the results to `deliver` in order, on this thread.
 /// The first error, in order, ends it.
 pub(crate) fn in_order<T: Send, E: Send>(
@@ -124,17 +136,18 @@ pub(crate) fn in_order<T: Send, E: Send>(
     let turn = Mutex::new(Turn { next: 0, delivered: 0, stopped: false });
     let moved = Condvar::new();
     let ahead = jobs * AHEAD_PER_THREAD;
-    let lock = || turn.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+    let lock = || turn.lock().unwrap_or_else(PoisonError::into_inner);
     std::thread::scope(|scope| {
         let (send, receive) = mpsc::channel();
         for _ in 0..jobs.min(count) {
             let send = send.clone();
-            let (work, lock, moved) = (&work, &lock, &moved);
+            let (work, lock, turn, moved) = (&work, &lock, &turn, &moved);
             scope.spawn(move || {
+                let _stop = StopOnPanic(turn, moved);
                 loop {
                     let mut turn = lock();
                     while !turn.stopped && turn.next < count && turn.next >= turn.delivered + ahead {
-                        turn = moved.wait(turn).unwrap_or_else(std::sync::PoisonError::into_inner);
+                        turn = moved.wait(turn).unwrap_or_else(PoisonError::into_inner);
                     }
                     if turn.stopped || turn.next >= count {
                         return;
@@ -194,6 +207,13 @@ mod tests {
             done.unwrap();
             assert_eq!(got, (0..100).map(|i| i * i).collect::<Vec<_>>());
         }
+    }
+
+    #[test]
+    fn a_panic_ends_the_work() {
+        let work = |i| if i == 0 { panic!("on purpose") } else { Ok::<usize, ()>(i) };
+        let done = std::panic::catch_unwind(|| in_order(1000, 3, work, |_| Ok(())));
+        assert!(done.is_err());
     }
 
     #[test]

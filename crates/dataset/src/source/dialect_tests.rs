@@ -123,6 +123,9 @@ fn isaac_lab_nests_observations_and_states() {
 fn d4rl_is_cut_at_terminals_and_timeouts() {
     let (_dir, source) = made(|file| {
         floats(file, "observations", &[10, 4]);
+        let unit: VarLenUnicode = "m".parse().unwrap();
+        let observations = file.dataset("observations").unwrap();
+        observations.new_attr::<VarLenUnicode>().create("unit").unwrap().write_scalar(&unit).unwrap();
         floats(file, "actions", &[10, 2]);
         floats(file, "rewards", &[10]);
         bytes(file, "terminals", &[10], |i| u8::from(i == 2));
@@ -135,6 +138,8 @@ fn d4rl_is_cut_at_terminals_and_timeouts() {
     let lengths: Vec<_> = plan.demos.iter().map(|d| d.length).collect();
     assert_eq!(lengths, [3, 4]);
     assert!(plan.notes[0].contains("last 3 steps"), "{:?}", plan.notes);
+    let of_run = &source.read_demo(0).unwrap().inner_attrs["obs/flat"]["unit"];
+    assert_eq!(of_run.to_text().as_deref(), Some("m"));
     let second = source.read_demo(1).unwrap();
     let expected: Vec<f64> = (3 * 4..7 * 4).map(|i| f64::from(i) * 0.5).collect();
     assert_eq!(second.datasets["obs/flat"].to_f64().unwrap(), expected);
@@ -369,4 +374,34 @@ fn numbers_of_another_byte_order_are_read_and_noted() {
     assert_eq!(source.read_demo(0).unwrap(), before);
     assert_eq!(source.plan().demos[0].keys["obs/ee_pos"].shape, key.shape);
     assert!(source.plan().notes[0].ends_with("data/demo_0/actions, data/demo_0/obs/ee_pos, data/demo_0/rewards"));
+}
+
+#[test]
+fn files_of_one_number_get_others_and_a_stray_file_takes_none() {
+    let dir = tempfile::tempdir().unwrap();
+    for name in ["episode_0", "mirror_episode_0", "episode_1"] {
+        episode(&dir.path().join(format!("{name}.hdf5")), 3);
+    }
+    let file = File::create(dir.path().join("weather_1.hdf5")).unwrap();
+    floats(&file, "temperature", &[4]);
+    file.close().unwrap();
+    let source = Source::open(dir.path()).unwrap();
+    let ids: Vec<_> = source.plan().demos.iter().map(|d| d.id.as_str()).collect();
+    assert_eq!(ids, ["demo_0", "demo_1", "demo_2"]);
+    let told = "mirror_episode_0.hdf5 is demo_1, episode_1.hdf5 is demo_2";
+    assert!(source.plan().notes.iter().any(|note| note.ends_with(told)), "{:?}", source.plan().notes);
+    assert_eq!(source.plan().problems[0].demo.as_deref(), Some("weather_1.hdf5"));
+}
+
+#[test]
+fn files_at_several_depths_are_not_left_out_in_silence() {
+    let dir = tempfile::tempdir().unwrap();
+    for folder in ["a", "b/c"] {
+        std::fs::create_dir_all(dir.path().join(folder)).unwrap();
+    }
+    episode(&dir.path().join("a/episode_0.hdf5"), 3);
+    assert_eq!(Source::open(dir.path()).unwrap().plan().demos.len(), 1);
+    episode(&dir.path().join("b/c/episode_1.hdf5"), 3);
+    let error = Source::open(dir.path()).unwrap_err().to_string();
+    assert!(error.ends_with("found a/episode_0.hdf5, and deeper b/c/episode_1.hdf5"), "{error}");
 }

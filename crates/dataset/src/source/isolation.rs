@@ -13,7 +13,7 @@ use rustix::process::{Resource, Rlimit};
 use serde::{Deserialize, Serialize};
 
 use super::codec::{Taker, put_array, put_demo};
-use super::local::Backend;
+use super::local::{Backend, MAX_FOLDERS};
 use super::{open_backend, video};
 use crate::error::InputError;
 use crate::plan::{DemoPlan, Plan};
@@ -32,9 +32,10 @@ const SILENCE: Duration = Duration::from_secs(8);
 const STALL: Duration = Duration::from_secs(120);
 /// How often it is looked at.
 const LOOK: Timespec = Timespec { tv_sec: 0, tv_nsec: 500_000_000 };
-/// Processor time of the reading process: this, and a second for each so many bytes of the file.
+/// Processor time of the reading process: this, and a second for each so many bytes and files.
 const CPU_SECONDS: u64 = 6;
 const BYTES_PER_CPU_SECOND: u64 = 256 << 10;
+const FILES_PER_CPU_SECOND: u64 = 100;
 /// The longest answer.
 const MAX_ANSWER: u64 = 384 << 20;
 /// Demos of a plan that are sent together, and the most bytes of all of them.
@@ -119,18 +120,35 @@ pub(super) fn limit_cpu(seconds: u64, maximum: Option<u64>) -> std::io::Result<(
     Ok(rustix::process::setrlimit(Resource::Cpu, Rlimit { current: Some(seconds), maximum })?)
 }
 
-/// Bytes of a file, or of everything in a folder.
-fn source_bytes(path: &Path, depth: usize) -> u64 {
-    match std::fs::read_dir(path) {
-        Ok(entries) if depth > 0 => entries.flatten().map(|e| source_bytes(&e.path(), depth - 1)).sum(),
-        _ => std::fs::metadata(path).map_or(0, |m| m.len()),
+/// Processor time for a file, or for everything in a folder.
+fn cpu_seconds(path: &Path) -> u64 {
+    fn add(path: &Path, depth: usize, (bytes, files): (&mut u64, &mut u64)) {
+        match std::fs::read_dir(path) {
+            Ok(entries) if depth > 0 => {
+                for entry in entries.flatten() {
+                    // links to folders may lead in a circle
+                    let depth = if entry.file_type().is_ok_and(|kind| kind.is_dir()) { depth - 1 } else { 0 };
+                    add(&entry.path(), depth, (&mut *bytes, &mut *files));
+                }
+            }
+            _ => {
+                *bytes += std::fs::metadata(path).map_or(0, |m| m.len());
+                *files += 1;
+            }
+        }
     }
+    let (mut bytes, mut files) = (0, 0);
+    add(path, MAX_FOLDERS + 1, (&mut bytes, &mut files));
+    seconds_for(bytes, files)
+}
+
+fn seconds_for(bytes: u64, files: u64) -> u64 {
+    CPU_SECONDS + bytes / BYTES_PER_CPU_SECOND + files / FILES_PER_CPU_SECOND
 }
 
 fn serve(path: &Path) -> std::io::Result<()> {
-    let allowed = |bytes: u64| CPU_SECONDS + bytes / BYTES_PER_CPU_SECOND;
-    let bytes = source_bytes(path, 4);
-    limit_self(allowed(bytes), None)?;
+    let first = cpu_seconds(path);
+    limit_self(first, None)?;
     let mut out = std::io::stdout().lock();
     let _ = rustix::pipe::fcntl_setpipe_size(&out, 1 << 20);
     let mut beat_out = std::io::stdout();
@@ -146,7 +164,8 @@ fn serve(path: &Path) -> std::io::Result<()> {
     let local = match opened {
         Ok((local, plan)) => {
             // links may lead to more files
-            let seconds = allowed(bytes.max(plan.files.iter().map(|(_, bytes)| bytes).sum()));
+            let bytes = plan.files.iter().map(|(_, bytes)| bytes).sum();
+            let seconds = first.max(seconds_for(bytes, plan.files.len() as u64));
             limit_cpu(seconds, Some(seconds))?;
             send_json(&mut out, PLAN, &plan.without_demos())?;
             plan.demos.chunks(DEMOS_AT_ONCE).try_for_each(|demos| send_json(&mut out, DEMOS, &demos))?;
@@ -369,9 +388,9 @@ fn wait_briefly(child: &mut Child) -> Option<std::process::ExitStatus> {
 fn ending(status: std::process::ExitStatus) -> String {
     use std::os::unix::process::ExitStatusExt;
     match status.signal() {
-        Some(9 | 24) => "ran out of processor time, or was killed".to_owned(),
-        Some(6) => "ran out of memory or gave up (SIGABRT)".to_owned(),
-        Some(11) => "crashed (SIGSEGV)".to_owned(),
+        Some(9 | 24) => "came to its limit of processor time, or was killed,".to_owned(),
+        Some(6) => "came to its limit of memory or gave up (SIGABRT)".to_owned(),
+        Some(11) => "crashed (SIGSEGV), so the file is damaged,".to_owned(),
         Some(n) => format!("crashed (signal {n})"),
         None => format!("ended with {}", status.code().unwrap_or(-1)),
     }
@@ -552,6 +571,23 @@ mod tests {
         let (read, waited) = silent_for("sh", &["-c", "(sleep 10; kill -CONT $$; echo yes) & kill -STOP $$; wait"]);
         assert!(waited >= SILENCE, "{waited:?}");
         assert!(read.expect("its word") > 0);
+    }
+
+    #[test]
+    fn deep_folders_and_many_files_get_their_time() {
+        let dir = tempfile::tempdir().expect("a folder");
+        assert_eq!(cpu_seconds(dir.path()), CPU_SECONDS);
+        let deep = dir.path().join("success/lab/2023-04-20/morning");
+        std::fs::create_dir_all(&deep).expect("writable");
+        let file = std::fs::File::create(deep.join("trajectory.h5")).expect("writable");
+        file.set_len(10 * BYTES_PER_CPU_SECOND).expect("writable");
+        for number in 1..2 * FILES_PER_CPU_SECOND {
+            std::fs::write(deep.join(number.to_string()), "").expect("writable");
+        }
+        assert_eq!(cpu_seconds(dir.path()), CPU_SECONDS + 12);
+        // a link to a folder above is not followed
+        std::os::unix::fs::symlink(dir.path(), dir.path().join("again")).expect("writable");
+        assert!(cpu_seconds(dir.path()) <= CPU_SECONDS + 13);
     }
 
     #[test]

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use super::dialect::{self, DemoDraft, Draft, Survey};
-use super::walk::{Walked, check_signature};
+use super::walk::{DatasetNode, Walked, check_signature};
 use crate::error::InputError;
 use crate::plan::{DemoPlan, Join, KeyPlan, Plan, Problem};
 use crate::tree::{Array, Attrs, Demo, Dtype};
@@ -121,24 +121,41 @@ fn files_of(folder: &Path) -> Result<Vec<PathBuf>, InputError> {
     let mut found = Vec::new();
     let mut others = BTreeSet::new();
     let mut folders = Vec::new();
-    list_files(folder, &mut found, &mut folders, &mut others)?;
+    list_files(folder, true, &mut found, &mut folders, &mut others)?;
+    let mut deeper = Vec::new();
     // an episode a folder, a folder of tasks, a folder beside instructions and videos
     for _ in 0..MAX_FOLDERS {
-        if !found.is_empty() {
-            break;
-        }
+        let above = !found.is_empty();
+        let into = if above { &mut deeper } else { &mut found };
         for folder in std::mem::take(&mut folders) {
-            list_files(&folder, &mut found, &mut folders, &mut BTreeSet::new())?;
+            let listed = list_files(&folder, !above, into, &mut folders, &mut BTreeSet::new());
+            // what is beside the files need not be readable
+            listed.or_else(|error| if above { Ok(()) } else { Err(error) })?;
         }
     }
     if found.is_empty() {
         return Err(no_demonstrations(folder, &others));
     }
+    if !deeper.is_empty() {
+        let expected = "HDF5 files at one depth (name one of the folders, or move the others away)";
+        return Err(InputError::UnknownLayout {
+            path: folder.to_owned(),
+            expected: expected.to_owned(),
+            found: format!("{}, and deeper {}", names_in(folder, found), names_in(folder, deeper)),
+        });
+    }
     found.sort_by_cached_key(|path| (file_number(path), path.clone()));
     Ok(found)
 }
 
-/// The number at the end of a file's name, which orders the files of a folder.
+/// Paths from a folder on, in a line.
+fn names_in(folder: &Path, mut paths: Vec<PathBuf>) -> String {
+    paths.sort();
+    let names: Vec<_> = paths.iter().map(|path| path.strip_prefix(folder).unwrap_or(path).to_string_lossy()).collect();
+    dialect::list(names.iter().map(|name| &**name))
+}
+
+/// The number at the end of a file's name, which orders the files of a folder; the largest of all if there is none.
 pub(crate) fn file_number(path: &Path) -> u64 {
     let stem = path.file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();
     let digits = stem.bytes().rev().take_while(u8::is_ascii_digit).count();
@@ -165,11 +182,13 @@ fn no_demonstrations(folder: &Path, names: &BTreeSet<String>) -> InputError {
 }
 
 /// Folders in folders are looked through so deep: DROID has four.
-const MAX_FOLDERS: usize = 5;
+pub(super) const MAX_FOLDERS: usize = 5;
 
-/// Sorts what is in a folder into HDF5 files, folders and the names of everything else.
+/// Sorts what is in a folder into HDF5 files, folders and the names of everything else. Files of other names are opened to
+/// see whether they are HDF5 only if `signed`.
 fn list_files(
     folder: &Path,
+    signed: bool,
     found: &mut Vec<PathBuf>,
     folders: &mut Vec<PathBuf>,
     others: &mut BTreeSet<String>,
@@ -180,7 +199,7 @@ fn list_files(
         let path = entry.path();
         let hidden = path.file_name().is_some_and(|name| name.as_encoded_bytes().starts_with(b"."));
         let named = path.extension().is_some_and(|e| EXTENSIONS.iter().any(|known| e.eq_ignore_ascii_case(known)));
-        if !hidden && path.is_file() && (named || check_signature(&path).is_ok()) {
+        if !hidden && (named || signed) && path.is_file() && (named || check_signature(&path).is_ok()) {
             found.push(path);
             continue;
         }
@@ -193,6 +212,35 @@ fn list_files(
         }
     }
     Ok(())
+}
+
+fn datasets_of(file: &Walked) -> impl Iterator<Item = (&Walked, &str, &DatasetNode)> {
+    file.datasets.iter().map(move |(path, node)| (file, path, node))
+}
+
+/// Bytes of the datasets that belong to no demo, at most: they are read at once.
+const MAX_OUTSIDE: u64 = 192 << 20;
+
+/// Refuses datasets that are too large to be read at once, by the name of the largest.
+fn fits<'w>(datasets: impl Iterator<Item = (&'w Walked, &'w str, &'w DatasetNode)>) -> Result<(), InputError> {
+    let bytes = |node: &DatasetNode| {
+        let size = node.dtype.size().unwrap_or(0) as u64;
+        node.shape.iter().fold(size, |bytes, &extent| bytes.saturating_mul(extent as u64))
+    };
+    let (mut all, mut largest) = (0_u64, None);
+    for (file, path, node) in datasets {
+        all = all.saturating_add(bytes(node));
+        largest = largest.max(Some((bytes(node), path, &file.path)));
+    }
+    match largest.filter(|_| all > MAX_OUTSIDE) {
+        Some((_, path, file)) => Err(InputError::TooLarge {
+            path: file.clone(),
+            object: format!("{path} and what else belongs to no demo (--no-lossless leaves it out)"),
+            bytes: all,
+            limit: MAX_OUTSIDE,
+        }),
+        None => Ok(()),
+    }
 }
 
 impl Backend for Local {
@@ -234,10 +282,11 @@ impl Backend for Local {
                 root.inner_attrs.insert(path.clone(), file.attrs(path)?);
             }
         }
-        for (path, node) in &file.datasets {
-            if in_demo(path) || used.contains(path) {
-                continue;
-            }
+        let outside = |path: &str| !in_demo(path) && !used.contains(path);
+        if datasets {
+            fits(datasets_of(file).filter(|(_, path, _)| outside(path)))?;
+        }
+        for (path, node) in file.datasets.iter().filter(|(path, _)| outside(path)) {
             if datasets {
                 root.datasets.insert(path.to_owned(), file.read(path, None)?);
             }
@@ -321,9 +370,12 @@ impl Local {
         for (name, demos) in &self.plan.masks {
             root.datasets.insert(format!("mask/{name}"), Array::from_fixed_strings(demos));
         }
+        let outside = |path: &str| !path.starts_with("data/") && !path.starts_with("mask/");
+        if datasets {
+            fits(self.survey.files.iter().flat_map(datasets_of).filter(|(_, path, _)| outside(path)))?;
+        }
         for file in &self.survey.files {
             let name = file.path.file_name().unwrap_or_default().to_string_lossy();
-            let outside = |path: &str| !path.starts_with("data/") && !path.starts_with("mask/");
             for (path, _) in file.groups.iter().filter(|(path, node)| node.attrs > 0 && outside(path)) {
                 let below = if path.is_empty() { String::new() } else { format!("/{path}") };
                 root.inner_attrs.insert(format!("files/{name}{below}"), file.attrs(path)?);

@@ -35,6 +35,8 @@ pub use writer::{RobomimicWriter, WriteOptions};
 
 /// The most that [`Source::read_demo`] reads at once.
 const MAX_DEMO: u64 = 512 << 20;
+/// Steps of an episode, at most, where they are stated and not stored.
+const MAX_STEPS: usize = 1 << 24;
 /// How much is asked of the HDF5 library in one go.
 const WINDOW: u64 = 16 << 20;
 /// How much is read straight from the file at once where it is used in order: it stays in a processor's cache.
@@ -113,15 +115,16 @@ impl Source {
         self.exempt.extend(keys);
     }
 
-    /// Leaves out the demos for which `bad` gives true of their position, and every problem that is theirs.
-    pub(crate) fn leave_out(&mut self, bad: &dyn Fn(usize) -> bool) {
-        let all = self.plan.demos.len();
-        let before = self.positions.take().unwrap_or_else(|| (0..all).collect());
-        let kept: Vec<usize> = (0..all).filter(|&index| !bad(index)).collect();
-        self.positions = Some(kept.iter().map(|&index| before[index]).collect());
-        self.plan.demos = kept.into_iter().map(|index| self.plan.demos[index].clone()).collect();
+    /// Leaves out the demos of these ids, and every problem of a demo that is not there.
+    pub(crate) fn leave_out(&mut self, bad: &BTreeSet<&str>) {
+        let demos = std::mem::take(&mut self.plan.demos);
+        let before = self.positions.take().unwrap_or_else(|| (0..demos.len()).collect());
+        let kept = before.into_iter().zip(demos).filter(|(_, demo)| !bad.contains(demo.id.as_str()));
+        let (positions, demos) = kept.unzip();
+        (self.positions, self.plan.demos) = (Some(positions), demos);
         let Plan { demos, problems, .. } = &mut self.plan;
-        problems.retain(|p| p.demo.as_ref().is_none_or(|id| demos.iter().any(|demo| demo.id == *id)));
+        let ids: BTreeSet<&str> = demos.iter().map(|demo| demo.id.as_str()).collect();
+        problems.retain(|p| p.demo.as_ref().is_none_or(|id| ids.contains(id.as_str())));
     }
 
     /// Where the backend has a demo.
@@ -159,9 +162,10 @@ impl Source {
         let bytes =
             chosen.iter().fold(0_u64, |sum, (_, k)| sum.saturating_add(k.bytes().unwrap_or(u64::from(u8::MAX))));
         if bytes > MAX_DEMO {
+            let largest = chosen.iter().max_by_key(|(_, k)| k.bytes()).map_or("", |(key, _)| key);
             return Err(InputError::TooLarge {
                 path: self.plan.path.clone(),
-                object: plan.id.clone(),
+                object: format!("{}, of which {largest} is the largest", plan.id),
                 bytes,
                 limit: MAX_DEMO,
             }

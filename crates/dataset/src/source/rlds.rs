@@ -16,6 +16,7 @@ use serde_json::Value;
 
 use self::example::{CUT, byte_strings, count, elements, lists, masked_crc};
 use self::features::{Form, form, key_of, leaves};
+use super::MAX_STEPS;
 use super::local::Backend;
 use super::value::one_line;
 use crate::error::InputError;
@@ -30,8 +31,6 @@ const MAX_ROWS: usize = 320 << 20;
 const MAX_IMAGE: usize = 64 << 20;
 /// Bytes of a JSON file, at most.
 const MAX_JSON: u64 = 16 << 20;
-/// Steps of an episode, at most.
-const MAX_STEPS: usize = 1 << 24;
 
 /// A data set of episodes.
 pub(super) struct Rlds {
@@ -141,6 +140,10 @@ impl Rlds {
                 (Ok((form, shape)), None) => metadata.push(Leaf { key: name.clone(), name, form, shape }),
                 (Ok((form, shape)), Some(step)) => {
                     let key = key_of(step);
+                    if let Some(other) = self.leaves.iter().find(|leaf| leaf.key == key) {
+                        left_out.insert(name, format!("{} becomes {key} too", other.name));
+                        continue;
+                    }
                     self.leaves.push(Leaf { name, key, form, shape });
                 }
                 (Err(what), Some(step)) => {

@@ -379,6 +379,24 @@ fn wrong_length_and_wrong_num_samples() {
         error.to_string().ends_with("demo_0: actions: expected 6 (num_samples) steps, found shape [5, 7]"),
         "{error}"
     );
+    let plan = Source::open(&path).unwrap().plan().clone();
+    assert!(plan.problems.iter().any(|p| p.fatal && p.key.is_none()), "{:?}", plan.problems);
+}
+
+#[test]
+fn what_belongs_to_no_demo_and_is_too_large_is_named() {
+    let (_dir, path) = saved(&[small_demo("demo_0", 3)], |_| {});
+    let file = hdf5::File::open_rw(&path).unwrap();
+    let (size, block) = (200_usize << 20, 8_usize << 20);
+    let large = file.new_dataset_builder().chunk((block,)).empty::<u8>().shape((block..,)).create("large").unwrap();
+    large.write_raw(&vec![7_u8; block]).unwrap();
+    large.resize((size,)).unwrap();
+    drop(large);
+    file.close().unwrap();
+    let source = Source::open(&path).unwrap();
+    let error = input_error(source.root()).to_string();
+    assert!(error.contains("large and what else") && error.contains("--no-lossless"), "{error}");
+    source.data_attrs().unwrap();
 }
 
 #[test]

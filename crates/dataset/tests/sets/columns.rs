@@ -281,20 +281,68 @@ fn what_other_programs_say_of_an_episode_goes_with_it() {
             });
             RecordBatch::try_from_iter(own.chain(others)).unwrap()
         });
-        edit_json(set, INFO, |info| info["splits"] = json!({"train": "0:1", "val": "1:3"}));
+        edit_json(set, INFO, |info| {
+            info["splits"] = json!({"train": "0:1", "val": "1:3"});
+            (info["recorder"], info["site"]) = (json!("rig"), json!(names.len()));
+        });
     }
     let column = |set: &Path, name: &str| read_table(&set.join(EPISODES)).column_by_name(name).unwrap().clone();
     keep(&one, &Destination::New(part.clone()), &numbers(1..3), &mut going).unwrap();
     for name in ["operator", "scene"] {
         assert_eq!(column(&part, name).as_string::<i32>(), &StringArray::from(texts(name, 1..3)));
     }
+    let notes = export(&part, &dir.path().join("part.hdf5"), &WriteOptions::default(), &mut quiet).unwrap().notes;
+    assert!(notes.iter().any(|note| note.ends_with("are left out: operator, scene")), "{notes:?}");
     // null where a set lacks the column
     let notes = merge(&[one, two], &both, &mut going).unwrap().notes;
     let twice = [texts("operator", 0..3), texts("operator", 0..3)].concat();
     assert_eq!(column(&both, "operator").as_string::<i32>(), &StringArray::from(twice));
     let scenes = texts("scene", 0..3).into_iter().map(Some).chain([None, None, None]);
     assert_eq!(column(&both, "scene").as_string::<i32>(), &scenes.collect::<StringArray>());
+    let info: serde_json::Value = serde_json::from_slice(&std::fs::read(both.join(INFO)).unwrap()).unwrap();
+    assert_eq!((&info["recorder"], info.get("site")), (&json!("rig"), None));
+    assert!(notes.iter().any(|note| note.starts_with("the sets differ in site of meta/info.json")), "{notes:?}");
     // no range holds the splits of both
     assert!(notes.iter().any(|note| note.starts_with("splits (train, val) are left out")), "{notes:?}");
     assert_eq!(problems(&verify(&both, &mut quiet).unwrap()), Vec::<String>::new());
+}
+
+#[test]
+fn a_file_states_no_columns_that_no_set_can_have() {
+    let dir = tempfile::tempdir().unwrap();
+    let file = dir.path().join("a.hdf5");
+    let column = |name: &str, key: &str, shape: &[usize]| {
+        let dtype = if shape.len() == 3 { "image" } else { "float32" };
+        json!({"name": name, "key": key, "feature": {"dtype": dtype, "shape": shape, "names": null}})
+    };
+    let state = || column("observation.state", "obs/qpos", &[2]);
+    for (more, said) in [
+        (
+            column("../../x", "obs/cam_image", &[8, 8, 3]),
+            "expected names that stay inside the folder, found \"../../x\"",
+        ),
+        (column("/x", "obs/cam_image", &[8, 8, 3]), "expected names that stay inside the folder, found \"/x\""),
+        (state(), "expected each name once, found observation.state twice"),
+        (column("timestamp", "obs/qpos", &[2]), "features.timestamp.shape: expected [1], found [2]"),
+        (column("index", "rewards", &[1]), "expected each name once, found index twice"),
+    ] {
+        let stated =
+            json!({"fps": 10, "environment": true, "columns": [column("action", "actions", &[3]), state(), more]});
+        let mut writer = RobomimicWriter::create(&file, &WriteOptions::default()).unwrap();
+        let mut demo = Demo { id: "demo_0".to_owned(), ..Demo::default() };
+        for (key, shape) in [("actions", vec![4, 3]), ("obs/qpos", vec![4, 2]), ("rewards", vec![4])] {
+            let values = vec![0.5; shape.iter().product()];
+            demo.datasets.insert(key.to_owned(), Array::from_f64(shape, &values));
+        }
+        let pixels = Array::from_u8(vec![4, 8, 8, 3], &[7; 4 * 8 * 8 * 3]);
+        demo.datasets.insert("obs/cam_image".to_owned(), pixels);
+        writer.set_data_attr("lerobot", &Array::from_str(&stated.to_string())).unwrap();
+        writer.add_demo(&demo).unwrap();
+        writer.finish().unwrap();
+        let refused = convert(&file, &dir.path().join("out"), &ConvertOptions::default(), &mut quiet).unwrap_err();
+        let text = refused.to_string();
+        assert!(text.contains("a.hdf5: data: attribute lerobot: features") && text.contains(said), "{text}");
+        std::fs::remove_file(&file).unwrap();
+        assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 0);
+    }
 }

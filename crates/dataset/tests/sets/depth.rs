@@ -335,6 +335,16 @@ fn what_is_no_distance_is_named_and_can_stay_beside() {
         export(&out, &back, &WriteOptions::default(), &mut quiet).unwrap();
         assert!(content(&back) == content(&file));
     }
+    // nor does a column of depth that the file of a data set states
+    let [file, bare, through, out] = ["a.hdf5", "bare", "through.hdf5", "out"].map(|name| dir.path().join(name));
+    write(&file, &three());
+    convert(&file, &bare, &ConvertOptions { lossless: false, ..options() }, &mut quiet).unwrap();
+    export(&bare, &through, &WriteOptions::default(), &mut quiet).unwrap();
+    let notes = convert(&through, &out, &ConvertOptions { depth: false, ..options() }, &mut quiet).unwrap().notes;
+    let note = format!("{FRONT_DEPTH} becomes no column: no depth does (--no-depth)");
+    assert!(notes.contains(&note), "{notes:?}");
+    let set = Dataset::open(&out).unwrap();
+    assert_eq!((set.depth_names().count(), set.cameras().collect::<Vec<_>>()), (0, vec![FRONT]));
 }
 
 #[test]
@@ -556,4 +566,17 @@ fn depth_as_video_is_refused_by_name() {
     }
     // the others can be read
     assert_eq!(set.depth_maps(WRIST_DEPTH, 0).unwrap().unit.as_deref(), Some("mm"));
+}
+
+#[test]
+fn depth_of_an_impossible_size_is_refused_by_name() {
+    let dir = tempfile::tempdir().unwrap();
+    let root = dir.path().join("set");
+    copy(&theirs(), &root);
+    let info = root.join("meta/info.json");
+    let mut told: serde_json::Value = serde_json::from_slice(&std::fs::read(&info).unwrap()).unwrap();
+    told["features"][FRONT_DEPTH]["shape"] = serde_json::json!([3_000_000_000_u64, 3_000_000_000_u64, 1]);
+    std::fs::write(&info, told.to_string()).unwrap();
+    let found = Dataset::open(&root).and_then(|set| set.depth_maps(FRONT_DEPTH, 0)).unwrap_err().to_string();
+    assert!(found.contains(FRONT_DEPTH) && found.contains("3000000000"), "{found}");
 }

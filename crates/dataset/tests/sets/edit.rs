@@ -277,6 +277,31 @@ fn two_files_become_one_with_new_numbers_for_demos_that_both_have() {
 }
 
 #[test]
+fn what_only_some_of_the_sets_say_is_named() {
+    let dir = tempfile::tempdir().unwrap();
+    let set = |name: &str, first: usize, root: &Demo| {
+        let file = dir.path().join(format!("{name}.hdf5"));
+        let mut writer = RobomimicWriter::create(&file, &WriteOptions::default()).unwrap();
+        writer.set_root(root).unwrap();
+        (first..first + 2).for_each(|number| writer.add_demo(&synthetic(number, 3, None)).unwrap());
+        writer.finish().unwrap();
+        let out = dir.path().join(name);
+        convert(&file, &out, &ConvertOptions { fps: Some(20.0), ..ConvertOptions::default() }, &mut quiet).unwrap();
+        out
+    };
+    let mut root = Demo::default();
+    root.datasets.insert("mask/train".to_owned(), Array::from_strings(vec![1], &["demo_0".to_owned()]));
+    root.inner_attrs.entry("data".to_owned()).or_default().insert("seeds".to_owned(), Array::from_str("10-19"));
+    let (one, two, all) = (set("one", 0, &root), set("two", 2, &Demo::default()), dir.path().join("all"));
+    let notes = merge(&[one, two.clone()], &all, &mut going).unwrap().notes;
+    let masks = format!("{} has no mask train: its 2 episodes are in none of the result's", two.display());
+    for note in ["1 of 2 sets state no seeds: 10-19 are those of the others", &masks] {
+        assert!(notes.iter().any(|n| n == note), "{notes:?}");
+    }
+    assert_eq!(Dataset::open(&all).unwrap().split("train").unwrap(), [0]);
+}
+
+#[test]
 fn files_that_differ_beside_their_demos_are_joined_as_far_as_they_agree() {
     let dir = tempfile::tempdir().unwrap();
     let options = ConvertOptions { fps: Some(20.0), ..ConvertOptions::default() };

@@ -441,3 +441,58 @@ fn tasks_in_disorder_are_those_of_the_episodes() {
         }
     }
 }
+
+#[test]
+fn a_feature_that_no_file_has_is_refused_and_named() {
+    let dir = tempfile::tempdir().unwrap();
+    let whole = dir.path().join("whole");
+    sound(&whole);
+    std::fs::remove_dir_all(whole.join("actrm")).unwrap();
+    for (dtype, shape) in [("string", vec![1]), ("image", vec![8, 8, 3])] {
+        let (set, out) = (dir.path().join(dtype), dir.path().join("out"));
+        copy(&whole, &set);
+        edit_json(&set, INFO, |info| {
+            info["features"]["more"] = json!({"dtype": dtype, "shape": shape, "names": null});
+        });
+        named(
+            &verify(&set, &mut quiet).unwrap(),
+            dtype,
+            &[
+                "no column more, which meta/info.json states",
+                "meta/info.json: features.more: expected a column of that name in data/chunk-000/file-000.parquet",
+            ],
+        );
+        for refused in [
+            Dataset::open(&set).map(drop),
+            keep(&set, &Destination::New(out.clone()), &numbers(0..1), &mut going).map(drop),
+            repair(&set, &Destination::New(out.clone()), Repair::default(), &mut going).map(drop),
+            export(&set, &out, &WriteOptions::default(), &mut quiet).map(drop),
+        ] {
+            let text = refused.unwrap_err().to_string();
+            assert!(text.contains(&format!("{DATA}: no column more, which meta/info.json states")), "{text}");
+        }
+        assert!(!out.exists());
+    }
+}
+
+#[test]
+fn masks_and_demos_are_held_against_the_episodes_that_there_are() {
+    const ORIGIN: &str = "actrm/info.json";
+    let dir = tempfile::tempdir().unwrap();
+    let set = dir.path().join("set");
+    sound(&set);
+    std::fs::remove_file(set.join("actrm/manifest.json")).unwrap();
+    edit_json(&set, INFO, |info| info["total_episodes"] = json!(DEMOS + 1));
+    edit_json(&set, ORIGIN, |origin| {
+        origin.as_object_mut().unwrap().remove("seal").unwrap();
+        (origin["lossless"], origin["masks"]) = (json!(false), json!({"train": [0, DEMOS]}));
+    });
+    let told = |words: &str| {
+        let chosen = dataset::edit::Selection { masks: vec!["train".to_owned()], ..Default::default() };
+        let refused = keep(&set, &Destination::New(dir.path().join("out")), &chosen, &mut going).unwrap_err();
+        assert!(refused.to_string().contains(words), "{refused}");
+    };
+    told("actrm.masks.train: expected episodes below 12, found 12");
+    edit_json(&set, ORIGIN, |origin| origin["demos"].as_array_mut().unwrap().push(json!("demo_99")));
+    told("actrm.demos: expected an id for each of 12 episodes, found 13");
+}

@@ -6,6 +6,7 @@ use dataset::{
     Array, ConvertOptions, ConvertReport, Dataset, DatasetError, Shard, Source, convert, convert_shard, merge_shards,
     shard_files,
 };
+use serde_json::{Value, json};
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
@@ -149,6 +150,13 @@ fn a_shard_that_was_stopped_is_converted_again_and_a_complete_one_stays() {
     let stopped = convert_shard(&source, &folder, &options, shard, stop).unwrap_err();
     assert!(matches!(stopped, DatasetError::Stopped { .. }), "{stopped}");
     assert!(!folder.exists());
+    // nor is a hash of a file of 64 GiB, most of it a hole, waited for
+    let (opened, first) = (std::fs::File::options().write(true).open(&source).unwrap(), Shard { index: 1, of: 2 });
+    let (size, start) = (opened.metadata().unwrap().len(), std::time::Instant::now());
+    opened.set_len(64 << 30).unwrap();
+    let stopped = convert_shard(&source, &dir.path().join("one"), &options, first, &mut |_, _| ControlFlow::Break(()));
+    assert!(matches!(stopped, Err(DatasetError::Stopped { .. })) && start.elapsed().as_secs() < 15, "{stopped:?}");
+    opened.set_len(size).unwrap();
     // as a kill leaves it
     std::fs::create_dir_all(dir.path().join(".two.partial-1/rows")).unwrap();
     let made = convert_shard(&source, &folder, &options, shard, &mut on).unwrap();
@@ -215,6 +223,24 @@ fn shards_that_do_not_belong_together_are_refused_by_name() {
         bad[content.len() / 2] ^= 1;
         std::fs::write(&path, bad).unwrap();
         told(&a, &[&format!("parts/1/{name}: shard 1/3: expected sha256"), "convert this shard again"]);
+        std::fs::write(&path, content).unwrap();
+    }
+    // one that was made up
+    type Change = fn(&mut Value);
+    let made_up: [(Change, &str); 2] = [
+        (
+            |state| state["head"]["features"][0][0] = json!("../../x"),
+            "parts/1/shard.json: features: expected names that stay inside the folder",
+        ),
+        (|state| state["shard"]["of"] = json!(1_000_000_000_000_000_u64), "from 1/N to N/N, of 100000 at most"),
+    ];
+    for (change, words) in made_up {
+        let path = a[0].join("shard.json");
+        let content = std::fs::read(&path).unwrap();
+        let mut state: Value = serde_json::from_slice(&content).unwrap();
+        change(&mut state);
+        std::fs::write(&path, state.to_string()).unwrap();
+        told(&a, &[words]);
         std::fs::write(&path, content).unwrap();
     }
     merge_shards(&at("out"), &a, &mut on).unwrap();

@@ -62,7 +62,7 @@ pub struct Args {
     /// again
     #[arg(long = "entity", value_name = "NAME=KEYS", value_parser = entity)]
     entities: Vec<(String, Vec<String>)>,
-    /// Frames a second [default: the control frequency that the file states]
+    /// Frames a second [default: the control frequency that the file states, or the usual one of its layout]
     #[arg(long, allow_negative_numbers = true)]
     fps: Option<f64>,
     /// How to store images

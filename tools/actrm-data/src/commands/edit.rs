@@ -49,9 +49,9 @@ enum Operation {
     Split(Split),
     /// Make one set of several with the same features, one after the other
     ///
-    /// Tasks become one table and masks are joined. Demos whose ids two sets have get new numbers. Where env_args are the same,
-    /// `actrm-data export` of the result gives one HDF5 file; what else the files have of their own beside the demos (such as
-    /// dates) is left out of it, and named.
+    /// Tasks become one table and masks are joined: the episodes of a set without a mask are not in it, and a note says so. Demos
+    /// whose ids two sets have get new numbers. Where env_args are the same, `actrm-data export` of the result gives one HDF5
+    /// file; what else the files have of their own beside the demos (such as dates) is left out of it, and named.
     #[command(after_help = "Examples:
   actrm-data edit merge lift more_lift --out all")]
     Merge(Merge),

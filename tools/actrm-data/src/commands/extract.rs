@@ -1,6 +1,7 @@
 use crate::cameras::CameraArgs;
+use crate::work::{STOPPED, Work};
 use anyhow::Result;
-use cli::{INTERRUPTED, Screen, SimulatorArgs, Stop};
+use cli::{INTERRUPTED, Screen, SimulatorArgs};
 use dataset::Source;
 use recording::{ExtractEnd, ExtractOptions, extract, recorded_task};
 use serde_json::json;
@@ -40,16 +41,11 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let source = Source::open_guarded(&args.raw)?;
     let task = recorded_task(&args.raw, &source)?;
     recording::refuse_existing(&args.out)?;
-    let _parents = cli::make_parent(&args.out)?;
-    let stop = Stop::install("stopped; nothing was written")?;
-    let out = args.out.clone();
-    stop.last_act(move || {
-        dataset::remove_unfinished(&out);
-    });
+    let work = Work::begin(&args.out)?;
     let mut spec = args.simulator.recorded_spec(&task, source.plan().env_args.as_ref())?;
     args.cameras.set(&mut spec);
-    let Some(mut pool) = args.simulator.start(spec, None, &stop)? else {
-        cli::note("stopped; nothing was written");
+    let Some(mut pool) = args.simulator.start(spec, None, work.stop())? else {
+        cli::note(STOPPED);
         return Ok(ExitCode::from(INTERRUPTED));
     };
     let options = ExtractOptions {

@@ -1,5 +1,5 @@
 use anyhow::Result;
-use dataset::{Dataset, Dtype, NonFinite, OldSet, Source};
+use dataset::{Dataset, NonFinite, OldSet, Source};
 use serde::Serialize;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -175,7 +175,7 @@ fn of_source(args: &Args) -> Result<Summary> {
         for (path, key) in &demo.keys {
             let row = keys.entry(path).or_insert_with(|| KeyRow {
                 key: path.to_owned(),
-                dtype: dtype_name(&key.dtype),
+                dtype: key.dtype.to_string(),
                 shapes: Vec::new(),
                 demos: 0,
                 min: ranges.get(path).map(|r| r.0),
@@ -217,10 +217,6 @@ fn of_source(args: &Args) -> Result<Summary> {
         problems,
         each: if args.demos { each.collect() } else { Vec::new() },
     })
-}
-
-fn dtype_name(dtype: &Dtype) -> String {
-    dtype.to_string()
 }
 
 fn of_dataset(args: &Args, set: &Dataset) -> Result<Summary> {

@@ -97,13 +97,12 @@ struct Dimension {
 
 fn dimensions(set: &Dataset, episode: &EpisodeMeta, name: &str) -> Vec<Dimension> {
     let Some(column) = set.column(name) else { return Vec::new() };
-    let names = set.info().features.get(name).map(|f| f.names.clone()).unwrap_or_default();
+    let names = set.names(name);
     (0..column.dim)
         .map(|d| {
             let all: Vec<f32> = column.data.iter().skip(d).step_by(column.dim).copied().collect();
-            let own = names.get(d).and_then(|n| n.as_str());
             Dimension {
-                name: match (column.dim, own) {
+                name: match (column.dim, names.get(d)) {
                     (1, _) => name.to_owned(),
                     (_, Some(own)) => format!("{name}: {own}"),
                     (_, None) => format!("{name}[{d}]"),

@@ -33,10 +33,7 @@ pub struct Args {
 pub fn run(args: &Args) -> Result<ExitCode> {
     let set = Dataset::open(&args.dir)?;
     let mut stats = match (&args.split, &args.episodes) {
-        (Some(split), _) => match set.split(split) {
-            Some(episodes) => set.exact_statistics_of(&episodes)?,
-            None => bail!("{}: no split {split}; there is {}", args.dir.display(), set.split_names().join(", ")),
-        },
+        (Some(split), _) => set.exact_statistics_of(&set.required_split(split)?)?,
         (None, Some(episodes)) => set.exact_statistics_of(episodes)?,
         (None, None) => set.stats().clone(),
     };
@@ -62,10 +59,10 @@ pub fn run(args: &Args) -> Result<ExitCode> {
 fn show(set: &Dataset, stats: &BTreeMap<String, FeatureStats>) -> String {
     let mut rows = Vec::new();
     for (name, s) in stats {
-        let names = set.info().features.get(name).map(|f| f.names.clone()).unwrap_or_default();
+        let names = set.names(name);
         for d in 0..s.mean.len() {
-            let dimension = match names.get(d).and_then(|n| n.as_str()) {
-                Some(text) if s.mean.len() > 1 => text.to_owned(),
+            let dimension = match names.get(d) {
+                Some(text) if s.mean.len() > 1 => text.clone(),
                 _ => d.to_string(),
             };
             let mut row = vec![if d == 0 { name.clone() } else { String::new() }, dimension];
@@ -76,4 +73,19 @@ fn show(set: &Dataset, stats: &BTreeMap<String, FeatureStats>) -> String {
     }
     let header = ["feature", "dimension", "mean", "std", "min", "1%", "50%", "99%", "max"];
     cli::table(&header, &rows, &[2, 3, 4, 5, 6, 7, 8])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::path::Path;
+
+    #[test]
+    fn dimensions_have_the_names_of_numbers_alone() {
+        let fixture =
+            Path::new(env!("CARGO_MANIFEST_DIR")).join("../../crates/dataset/tests/fixtures/lerobot_video_av1");
+        let set = Dataset::open(&fixture).expect("a data set");
+        let text = show(&set, set.stats());
+        assert!(text.contains("agentview") && !text.contains("height") && !text.contains("channels"), "{text}");
+    }
 }

@@ -3,7 +3,9 @@
 use super::super::info::{Feature, Features};
 use super::Input;
 use crate::error::{DatasetError, Result};
+use crate::source::list;
 use serde_json::Value;
+use std::collections::BTreeMap;
 
 /// The features that all inputs have, as the first one lists them.
 ///
@@ -66,6 +68,19 @@ pub(super) fn features(inputs: &[Input]) -> Result<Features> {
         }
     }
     Ok(agreed)
+}
+
+/// What `info.json` says besides, as far as all inputs say the same.
+pub(super) fn others(inputs: &[Input], notes: &mut Vec<String>) -> BTreeMap<String, Value> {
+    let each = || inputs.iter().map(|input| &input.set.info().other);
+    let all: BTreeMap<&String, &Value> = each().flatten().collect();
+    let (same, differ): (Vec<_>, Vec<_>) =
+        all.into_iter().partition(|(key, value)| each().all(|other| other.get(*key) == Some(*value)));
+    if !differ.is_empty() {
+        let keys = list(differ.iter().map(|(key, _)| key.as_str()));
+        notes.push(format!("the sets differ in {keys} of meta/info.json, which is left out"));
+    }
+    same.into_iter().map(|(key, value)| (key.clone(), value.clone())).collect()
 }
 
 fn shown(feature: &Feature) -> String {

@@ -195,7 +195,7 @@ pub fn split(
     progress: &mut Progress<'_>,
 ) -> Result<Vec<(String, EditReport)>> {
     let inputs = [Input::open(set, progress)?];
-    refuse_inside(&inputs, out)?;
+    refuse_inside(roots(&inputs), out)?;
     let parts = parts.resolve(&inputs[0].set, seed)?;
     let staging = Staging::create(out)?;
     let total: u64 = parts.iter().map(|(_, taken)| work_of(&inputs[0].set, taken)).sum();
@@ -213,7 +213,7 @@ pub fn split(
             source,
         })?;
         let mut report = compose(&inputs, vec![taken], &Renames::new(), None, &root, &mut advance)?;
-        report.notes.extend(left_behind(&inputs)?);
+        report.notes.extend(left_behind(roots(&inputs))?);
         made.push((name, report));
     }
     staging.publish()?;
@@ -228,20 +228,22 @@ pub fn split(
 pub fn merge(sets: &[PathBuf], out: &Path, progress: &mut Progress<'_>) -> Result<EditReport> {
     let inputs = sets.iter().map(|set| Input::open(set, progress)).collect::<Result<Vec<_>>>()?;
     let taken: Vec<Vec<usize>> = inputs.iter().map(|input| (0..input.set.episodes().len()).collect()).collect();
-    refuse_inside(&inputs, out)?;
+    refuse_inside(roots(&inputs), out)?;
     let staging = Staging::create(out)?;
     let mut report = told(&inputs, taken, &Renames::new(), None, staging.path(), progress)?;
-    report.notes.extend(left_behind(&inputs)?);
+    report.notes.extend(left_behind(roots(&inputs))?);
     staging.publish()?;
     Ok(report)
 }
 
-/// All of `set`, which has a file an episode, in the new directory `out`.
-pub(super) fn gather(set: Dataset, out: &Path, progress: &mut Progress<'_>) -> Result<EditReport> {
+/// All of `set`, which shows the folder `root` with a file an episode, in the new directory `out`.
+pub(super) fn gather(set: Dataset, root: &Path, out: &Path, progress: &mut Progress<'_>) -> Result<EditReport> {
+    refuse_inside([root], out)?;
     let staging = Staging::create(out)?;
     let all = (0..set.episodes().len()).collect();
     let input = Input { set, layout: None, joins: true };
-    let report = told(&[input], vec![all], &Renames::new(), None, staging.path(), progress)?;
+    let mut report = told(&[input], vec![all], &Renames::new(), None, staging.path(), progress)?;
+    report.notes.extend(left_behind([root])?);
     staging.publish()?;
     Ok(report)
 }
@@ -258,42 +260,47 @@ fn one(
     let inputs = [input];
     let staging = match to {
         Destination::New(out) => {
-            refuse_inside(&inputs, out)?;
+            refuse_inside(roots(&inputs), out)?;
             Staging::create(out)?
         }
         Destination::InPlace => Staging::replacing(inputs[0].set.root())?,
     };
     let mut report = told(&inputs, vec![taken], renames, repair, staging.path(), progress)?;
     report.notes.extend(match to {
-        Destination::New(_) => left_behind(&inputs)?,
+        Destination::New(_) => left_behind(roots(&inputs))?,
         Destination::InPlace => kept_beside(inputs[0].set.root())?,
     });
     staging.publish()?;
     Ok(report)
 }
 
+/// Where the sets lie.
+fn roots(inputs: &[Input]) -> impl Iterator<Item = &Path> {
+    inputs.iter().map(|input| input.set.root())
+}
+
 /// Refuses a result inside a set that it is made of: it would be lost with the set.
-fn refuse_inside(inputs: &[Input], out: &Path) -> Result<()> {
+fn refuse_inside<'a>(sets: impl IntoIterator<Item = &'a Path>, out: &Path) -> Result<()> {
     let parent = out.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
     // whoever creates it says what is wrong with the path
     let Ok(parent) = std::fs::canonicalize(parent) else { return Ok(()) };
-    let inside = |input: &&Input| std::fs::canonicalize(input.set.root()).is_ok_and(|root| parent.starts_with(root));
-    match inputs.iter().find(inside) {
+    let inside = |set: &&Path| std::fs::canonicalize(set).is_ok_and(|root| parent.starts_with(root));
+    match sets.into_iter().find(inside) {
         None => Ok(()),
-        Some(input) => Err(DatasetError::BadDataset {
+        Some(set) => Err(DatasetError::BadDataset {
             path: out.to_path_buf(),
             object: "output".to_owned(),
-            expected: format!("a place outside of {}", input.set.root().display()),
+            expected: format!("a place outside of {}", set.display()),
             found: "one inside".to_owned(),
         }),
     }
 }
 
 /// What lies beside the sets and is not carried over.
-fn left_behind(inputs: &[Input]) -> Result<Option<String>> {
+fn left_behind<'a>(sets: impl IntoIterator<Item = &'a Path>) -> Result<Option<String>> {
     let mut names = BTreeSet::new();
-    for input in inputs {
-        let others = other_files(input.set.root())?;
+    for set in sets {
+        let others = other_files(set)?;
         names.extend(others.iter().filter(|path| !path.starts_with("images")).map(|path| path.display().to_string()));
     }
     Ok((!names.is_empty()).then(|| format!("not copied: {}", list(names.iter().map(String::as_str)))))
@@ -415,6 +422,7 @@ fn compose(
         video_path: filmed.then(|| VIDEO_PATH.to_owned()),
         features: edit.features.clone(),
         actrm: origin,
+        other: agree::others(inputs, &mut notes),
         ..first.clone()
     };
     files.extend(meta::write_info(root, &check::sealed(info, root)?)?);

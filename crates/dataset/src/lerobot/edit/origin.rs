@@ -84,9 +84,13 @@ pub(super) fn of(edit: &Edit<'_>, notes: &mut Vec<String>) -> Result<Option<Prov
     }
     let seeds: Vec<Option<String>> = all.iter().map(|p| p.seeds.clone()).collect();
     let all_seeds = seeds_of_all(&seeds);
-    if all_seeds.is_none() && seeds.iter().any(Option::is_some) {
+    let silent = seeds.iter().filter(|text| text.is_none()).count();
+    if all_seeds.is_none() && silent < seeds.len() {
         notes.push("the sets differ in seeds, which are left out: they are no ranges".to_owned());
+    } else if let (Some(range), 1..) = (&all_seeds, silent) {
+        notes.push(format!("{silent} of {} sets state no seeds: {range} are those of the others", seeds.len()));
     }
+    notes.extend(lacking_masks(edit));
     let dialects: BTreeSet<&str> = all.iter().map(|p| p.dialect.as_str()).collect();
     let keys = |name: &str| edit.features.get(name).and_then(|_| keys_of(first, edit.before(name)));
     let entities =
@@ -151,6 +155,22 @@ fn demos(edit: &Edit<'_>, notes: &mut Vec<String>) -> Vec<String> {
         notes.push(format!("{others} demos have a new number: another set has a demo of theirs"));
     }
     ids
+}
+
+/// A note of each set that lacks masks which another one has.
+fn lacking_masks(edit: &Edit<'_>) -> Vec<String> {
+    fn names(input: &super::Input) -> impl Iterator<Item = &str> {
+        input.set.provenance().into_iter().flat_map(|p| p.masks.keys().map(String::as_str))
+    }
+    let all: BTreeSet<&str> = edit.inputs.iter().flat_map(names).collect();
+    let note = |input: &super::Input| {
+        let mine: BTreeSet<&str> = names(input).collect();
+        let lacking: Vec<&str> = all.difference(&mine).copied().collect();
+        let (set, episodes, masks) = (input.set.root().display(), input.set.episodes().len(), lacking.join(", "));
+        (!lacking.is_empty())
+            .then(|| format!("{set} has no mask {masks}: its {episodes} episodes are in none of the result's"))
+    };
+    edit.inputs.iter().filter_map(note).collect()
 }
 
 /// The masks of all inputs, in the numbers of the result.

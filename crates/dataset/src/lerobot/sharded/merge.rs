@@ -1,14 +1,18 @@
 //! Shards put together.
 
 use super::super::assembly::{Assembly, Encoders};
+use super::super::check::names;
 use super::super::convert::ConvertReport;
 use super::super::doubts::Doubts;
 use super::super::shards::StoredGroups;
 use super::super::staging::Staging;
 use super::super::verify::{hash_file, joint_hash};
-use super::{RECORDS_FILE, REST_FILE, ROWS, SIDE, STATE_FILE, State, StoredHead, groups_file, read_state, record};
+use super::{
+    MOST_SHARDS, RECORDS_FILE, REST_FILE, ROWS, SIDE, STATE_FILE, State, StoredHead, groups_file, read_state, record,
+};
 use crate::error::{DatasetError, Result};
 use crate::source::codec::Taker;
+use crate::source::list;
 use crate::tree::Demo;
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -31,7 +35,9 @@ pub fn merge_shards(
     let source_sha256 = source_hash(&shards)?;
     let (first, state) = &mut shards[0];
     let stored = std::mem::take(&mut state.head);
-    let head = stored.head().map_err(|source| DatasetError::Json { path: first.join(STATE_FILE), source })?;
+    let path = first.join(STATE_FILE);
+    let head = stored.head().map_err(|source| DatasetError::Json { path: path.clone(), source })?;
+    names(&path, &head.info.features)?;
     let rest = match head.layout {
         Some(_) => Some(read_rest(first, state)?),
         None => None,
@@ -96,6 +102,9 @@ fn in_order(folders: &[PathBuf]) -> Result<Vec<(PathBuf, State)>> {
             expected,
             found,
         };
+        if !state.shard.is_one() {
+            return Err(bad(format!("one from 1/N to N/N, of {MOST_SHARDS} at most"), state.shard.to_string()));
+        }
         let (first, conversion, source, of) =
             reference.get_or_insert_with(|| (folder, state.conversion.clone(), state.source.clone(), state.shard.of));
         if (&state.conversion, state.shard.of) != (&*conversion, *of) {
@@ -128,7 +137,7 @@ fn in_order(folders: &[PathBuf]) -> Result<Vec<(PathBuf, State)>> {
             path: first.clone(),
             object: format!("shards of {source}"),
             expected: format!("all {of}"),
-            found: format!("{} of them; missing: {}", found.len(), missing.join(", ")),
+            found: format!("{} of them; missing: {}", found.len(), list(missing.iter().map(String::as_str))),
         });
     }
     Ok(found.into_values().collect())

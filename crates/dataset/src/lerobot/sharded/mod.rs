@@ -16,7 +16,7 @@ mod record;
 pub use merge::merge_shards;
 
 use super::assembly::{Encoders, Head};
-use super::convert::Opened;
+use super::convert::{Opened, StopWhenDropped};
 use super::doubts::Doubts;
 use super::features::ConvertOptions;
 use super::info::{Feature, Features, Info};
@@ -26,7 +26,7 @@ use super::shards::{HashingFile, ShardWriter, WrittenFile};
 use super::side::Layout;
 use super::staging::Staging;
 use super::v2::version as old_version;
-use super::verify::hash_file;
+use super::verify::hash_file_unless;
 use super::work::Part;
 use crate::error::{DatasetError, InputError, Result};
 use crate::plan::{Dialect, Plan};
@@ -40,6 +40,7 @@ use std::io::Write;
 use std::ops::ControlFlow;
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
 
 /// What a shard says of itself.
 const STATE_FILE: &str = "shard.json";
@@ -59,15 +60,22 @@ pub struct Shard {
     pub of: usize,
 }
 
+/// More than anyone makes: of so many, those that are missing can be counted.
+const MOST_SHARDS: usize = 100_000;
+
+impl Shard {
+    fn is_one(&self) -> bool {
+        self.of <= MOST_SHARDS && (1..=self.of).contains(&self.index)
+    }
+}
+
 impl std::str::FromStr for Shard {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
         let parts = text.split_once('/').and_then(|(index, of)| Some((index.parse().ok()?, of.parse().ok()?)));
-        match parts {
-            Some((index, of)) if (1..=of).contains(&index) => Ok(Self { index, of }),
-            _ => Err("expected I/N, from 1/N to N/N".to_owned()),
-        }
+        let shard = parts.map(|(index, of)| Self { index, of }).filter(Self::is_one);
+        shard.ok_or_else(|| format!("expected I/N, from 1/N to N/N, of {MOST_SHARDS} at most"))
     }
 }
 
@@ -216,8 +224,8 @@ impl<'a> Job<'a> {
             let object = format!("shard {shard} of it");
             DatasetError::from(InputError::Unavailable { path: source.to_owned(), object, reason: reason.to_owned() })
         };
-        if shard.index == 0 || shard.index > shard.of {
-            return Err(refused("shards are counted from 1/N to N/N"));
+        if !shard.is_one() {
+            return Err(refused(&format!("shards are counted from 1/N to N/N, {MOST_SHARDS} at most")));
         }
         if options.skip_bad {
             return Err(refused("leaving out bad demos needs a look at all of them, which one run has"));
@@ -372,8 +380,11 @@ pub fn convert_shard(
         put_demo(&mut bytes, &rest);
         files.push(HashingFile::write_whole(root, REST_FILE, &bytes)?);
     }
+    let stop = AtomicBool::new(false);
     let (hashes, doubts) = std::thread::scope(|scope| {
-        let hashes = scope.spawn(|| job.hashes());
+        // after a failure nobody waits for the hash of a large file
+        let _stop = StopWhenDropped(&stop);
+        let hashes = scope.spawn(|| job.hashes(&stop));
         let (written, doubts) = job.write(root, &head, progress)?;
         files.extend(written);
         Ok::<_, DatasetError>((hashes.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))?, doubts))
@@ -400,9 +411,9 @@ pub fn convert_shard(
 
 impl Job<'_> {
     /// Names of the source's files, with the hashes that this shard states.
-    fn hashes(&self) -> Result<Vec<(String, Option<String>)>> {
+    fn hashes(&self, stop: &AtomicBool) -> Result<Vec<(String, Option<String>)>> {
         let of = |((path, _), owner): (&(PathBuf, u64), &usize)| {
-            let hash = (*owner == self.shard.index).then(|| hash_file(path)).transpose()?;
+            let hash = (*owner == self.shard.index).then(|| hash_file_unless(path, stop)).transpose()?;
             Ok((name_of(path), hash))
         };
         self.plan().files.iter().zip(&self.owners).map(of).collect()

@@ -10,7 +10,7 @@ use crate::lerobot::open::Dataset;
 use crate::lerobot::values::{Values, stats_of};
 use crate::lerobot::{pictures, read};
 use crate::stats::FeatureStats;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashSet};
 use std::fmt;
 use std::path::PathBuf;
 
@@ -129,6 +129,11 @@ impl Tables {
             let fault = Fault::new(Area::Info, FILE, "features", format!("{column}, a column of {file}"), "none");
             faults.push(Fault { repairable: false, ..fault });
         }
+        for (column, file) in &self.lacking {
+            let what = format!("features.{column}");
+            let fault = Fault::new(Area::Info, FILE, &what, format!("a column of that name in {file}"), "none");
+            faults.push(Fault { repairable: false, ..fault });
+        }
         for file in &self.files {
             let Some((chunk, number)) = place_of(&file.relative) else { continue };
             let named = filled(&info.data_path, chunk, number);
@@ -168,10 +173,12 @@ impl Tables {
                     let fault = Fault::new(Area::Tasks, FILE, "task_index", row, number);
                     faults.push(Fault { row: Some(row), ..fault });
                 }
-                for text in texts.iter().filter(|text| !table.texts.contains(text)) {
+                let there: HashSet<&String> = table.texts.iter().collect();
+                for text in texts.iter().filter(|text| !there.contains(text)) {
                     faults.push(Fault::new(Area::Tasks, FILE, "task", format!("a row for {text:?}"), "none"));
                 }
-                for (row, text) in table.texts.iter().enumerate().filter(|(i, t)| table.texts[..*i].contains(t)) {
+                let mut known = HashSet::new();
+                for (row, text) in table.texts.iter().enumerate().filter(|(_, text)| !known.insert(*text)) {
                     let fault = Fault::new(Area::Tasks, FILE, "task", "each task once", format!("{text:?} again"));
                     faults.push(Fault { row: Some(row), ..fault });
                 }

@@ -28,7 +28,7 @@ impl Layout for Aloha {
             if is_episode(file) {
                 episode(index, file, &mut out)?;
             } else {
-                out.problems.push(stranger(file, index, "action and observations/qpos as in the other files"));
+                out.problems.push(stranger(file, "action and observations/qpos as in the other files"));
             }
             beat();
         }

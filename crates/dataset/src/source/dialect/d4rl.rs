@@ -6,7 +6,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use super::{DemoDraft, Draft, Layout, Survey, key_plan};
 use crate::error::InputError;
 use crate::plan::{DemoPlan, Dialect, KeyPlan, Problem};
-use crate::source::walk::Walked;
+use crate::source::walk::{DatasetNode, Walked};
 use crate::tree::Dtype;
 
 pub(super) struct D4rl;
@@ -43,7 +43,7 @@ impl Layout for D4rl {
                 _ => {}
             }
         }
-        let mut demos = Vec::new();
+        let mut demos: Vec<DemoDraft> = Vec::new();
         let mut first = 0;
         for (step, _) in ends.iter().enumerate().filter(|(_, end)| **end) {
             demos.push(demo(file, demos.len(), first, step + 1 - first, steps));
@@ -55,6 +55,13 @@ impl Layout for D4rl {
                 "the last {} steps belong to an episode that does not end and are left out",
                 steps - first
             ));
+        }
+        // the attributes of what is cut belong to the run: the first episode keeps them
+        if let Some(first) = demos.first_mut() {
+            let cut = |path: &str| first.plan.keys.get(&name_of(path)).is_some_and(|key| *key.place.path == *path);
+            let of = |(path, node): (&str, &DatasetNode)| (node.attrs > 0 && cut(path)).then(|| path.to_owned());
+            let inner: Vec<String> = file.datasets.iter().filter_map(of).collect();
+            first.inner.extend(inner.into_iter().map(|path| (name_of(&path), 0, path)));
         }
         let attrs = file.attrs("")?;
         let texts = attrs.iter().filter_map(|(k, v)| Some((k.clone(), v.to_text()?))).collect();

@@ -34,7 +34,7 @@ impl Layout for Droid {
                 failed += usize::from(!episode(index, file, &mut out)?);
                 recorded += usize::from(file.path.with_file_name("recordings").is_dir());
             } else {
-                out.problems.push(stranger(file, index, "action and observation/robot_state as in the other files"));
+                out.problems.push(stranger(file, "action and observation/robot_state as in the other files"));
             }
             beat();
         }

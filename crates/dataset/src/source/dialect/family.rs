@@ -1,11 +1,14 @@
 //! What robomimic's layout and everything derived from it share: `/data/demo_<k>` and `/mask`.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::ops::Range;
+
+use serde_json::Value;
 
 use super::{DemoDraft, Draft, Survey, behavior, contents, list, number_after, wrong_lengths};
 use crate::error::InputError;
 use crate::lerobot::{mask_note, shared_notes};
-use crate::plan::{DemoPlan, Dialect, KeyPlan, Problem};
+use crate::plan::{DemoPlan, Dialect, ENV_KWARGS, KeyPlan, Problem};
 use crate::source::value::one_line;
 use crate::source::walk::Walked;
 use crate::tree::{Array, Attrs, Dtype};
@@ -45,7 +48,7 @@ pub(super) fn data_attr(file: &Walked, name: &str) -> Option<String> {
 }
 
 /// `ep_meta` of the first demo, if it is JSON.
-pub(super) fn first_ep_meta(file: &Walked) -> Option<serde_json::Value> {
+pub(super) fn first_ep_meta(file: &Walked) -> Option<Value> {
     let (_, id) = demo_ids(file).into_iter().next()?;
     let (_, attrs) = file.some_attrs(&format!("data/{id}"), &["ep_meta"]).ok()?;
     serde_json::from_str(&attrs.get("ep_meta")?.to_text()?).ok()
@@ -55,13 +58,16 @@ pub(super) fn first_ep_meta(file: &Walked) -> Option<serde_json::Value> {
 /// numbered through in the order of the files.
 pub(super) fn draft(survey: &Survey, dialect: Dialect, beat: &mut dyn FnMut()) -> Result<Draft, InputError> {
     if let Some(file) = survey.single() {
-        return draft_file((0, file), None, dialect, beat);
+        let mut out = draft_file((0, file), None, dialect, beat)?;
+        out.notes.extend(shared_notes(&out.masks));
+        return Ok(out);
     }
     let mut out = Draft::new(dialect);
-    let mut first = true;
+    let mut first: Option<(String, Decided)> = None;
+    let mut parts = Vec::new();
     for (index, file) in survey.files.iter().enumerate() {
-        let name = file.path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        let one = match draft_file((index, file), Some(out.demos.len() as u64), dialect, beat) {
+        let name = file_name(file);
+        let mut one = match draft_file((index, file), Some(out.demos.len() as u64), dialect, beat) {
             Ok(one) => one,
             Err(error) => {
                 out.problems.push(Problem::new(Some(&name), None, true, error));
@@ -71,15 +77,21 @@ pub(super) fn draft(survey: &Survey, dialect: Dialect, beat: &mut dyn FnMut()) -
         if let (Some(from), Some(to)) = (one.demos.first(), one.demos.last()) {
             out.notes.push(format!("{} to {} are the demos of {name}", from.plan.id, to.plan.id));
         }
+        let demos = out.demos.len()..out.demos.len() + one.demos.len();
+        let masks = one.masks.keys().cloned().collect();
+        parts.push(Part { name: name.clone(), masks, env_name: one.env_name.clone(), demos });
         // what all files say is said of the whole
-        if std::mem::take(&mut first) {
-            (out.env_args, out.env_name, out.env_version) = (one.env_args, one.env_name, one.env_version);
-            out.texts = one.texts;
-        } else {
+        let said = DECISIVE.map(|argument| decisive(one.env_args.as_ref(), argument));
+        if let Some((first, of_first)) = &first {
+            one.problems.extend(at_odds(survey, &out, (first, of_first), (&name, &said)));
             out.env_args = out.env_args.zip(one.env_args).and_then(|(a, b)| common(a, &b));
             out.env_name = out.env_name.filter(|mine| one.env_name.as_ref() == Some(mine));
             out.env_version = out.env_version.filter(|mine| one.env_version.as_ref() == Some(mine));
             out.texts.retain(|name, text| one.texts.get(name) == Some(text));
+        } else {
+            (out.env_args, out.env_name, out.env_version) = (one.env_args, one.env_name, one.env_version);
+            out.texts = one.texts;
+            first = Some((name, said));
         }
         for (name, ids) in one.masks {
             out.masks.entry(name).or_default().extend(ids);
@@ -88,16 +100,81 @@ pub(super) fn draft(survey: &Survey, dialect: Dialect, beat: &mut dyn FnMut()) -
         out.notes.extend(one.notes);
         out.problems.extend(one.problems);
     }
+    for Part { name, masks, env_name, demos } in parts {
+        let lacking: Vec<String> =
+            out.masks.keys().filter(|mask| !masks.contains(*mask)).map(|mask| format!("mask/{mask}")).collect();
+        if !lacking.is_empty() {
+            out.notes.push(format!("the demos of {name} are in none of the other files' {}", lacking.join(", ")));
+        }
+        // where no name is the whole's each demo keeps its own; LIBERO's have instructions
+        if out.env_name.is_none() && dialect != Dialect::Libero {
+            out.demos[demos].iter_mut().for_each(|demo| demo.plan.task = demo.plan.task.take().or(env_name.clone()));
+        }
+    }
+    out.notes.extend(shared_notes(&out.masks));
     match out.problems.first() {
         Some(problem) if out.demos.is_empty() => Err(problem.error.clone()),
         _ => Ok(out),
     }
 }
 
+/// What a file of a folder is to the whole.
+struct Part {
+    name: String,
+    masks: BTreeSet<String>,
+    env_name: Option<String>,
+    /// Its demos among all.
+    demos: Range<usize>,
+}
+
+/// What the arguments [`DECISIVE`] are in a file.
+type Decided = [Option<Value>; 2];
+
+fn file_name(file: &Walked) -> String {
+    file.path.file_name().unwrap_or_default().to_string_lossy().into_owned()
+}
+
+/// Arguments of the environment by which columns are made: files that are joined have to agree in them.
+const DECISIVE: [&str; 2] = ["control_freq", "reward_shaping"];
+
+/// What `env_args` say of such an argument; robosuite's rewards are sparse unless it is told otherwise.
+fn decisive(env_args: Option<&Value>, argument: &str) -> Option<Value> {
+    let said = env_args.and_then(|args| args.get("env_kwargs")?.get(argument)).filter(|value| !value.is_null());
+    said.cloned().or((argument == "reward_shaping").then_some(Value::Bool(false)))
+}
+
+/// The arguments in which a file differs from the first one, unless another did already.
+fn at_odds(
+    survey: &Survey,
+    out: &Draft,
+    (first, of_first): (&str, &Decided),
+    (name, said): (&str, &Decided),
+) -> Vec<Problem> {
+    let words = |value: &Option<Value>| value.as_ref().map_or_else(|| "nothing".to_owned(), Value::to_string);
+    let mut problems = Vec::new();
+    for (argument, (a, b)) in DECISIVE.iter().zip(of_first.iter().zip(said)) {
+        let agree =
+            a.is_none() && b.is_none() || a.clone().zip(b.as_ref()).is_some_and(|(a, b)| common(a, b).is_some());
+        if agree || crate::plan::at_odds(&out.problems, argument).is_some() {
+            continue;
+        }
+        let or = if *argument == "control_freq" { ", or --fps decides" } else { "" };
+        let error = InputError::BadAttribute {
+            path: survey.path.clone(),
+            object: "data".to_owned(),
+            attribute: format!("{ENV_KWARGS}{argument}"),
+            expected: format!("the same in all files (convert them separately{or})"),
+            found: format!("{} in {first}, {} in {name}", words(a), words(b)),
+        };
+        problems.push(Problem::new(None, None, false, error));
+    }
+    problems
+}
+
 /// What two JSON values agree in.
-fn common(a: serde_json::Value, b: &serde_json::Value) -> Option<serde_json::Value> {
-    use serde_json::Value;
+fn common(a: Value, b: &Value) -> Option<Value> {
     match (a, b) {
+        (Value::Number(a), Value::Number(b)) => (a.as_f64() == b.as_f64()).then_some(Value::Number(a)),
         (Value::Object(a), Value::Object(b)) => {
             let both = a.into_iter().filter_map(|(key, value)| Some((key.clone(), common(value, b.get(&key)?)?)));
             Some(Value::Object(both.collect()))
@@ -141,7 +218,7 @@ fn draft_file(
         let of_demo = number_after(name, "demo_").is_some();
         let id = match base {
             None => name.to_owned(),
-            Some(_) => format!("{} {name}", file.path.file_name().unwrap_or_default().to_string_lossy()),
+            Some(_) => format!("{} {name}", file_name(file)),
         };
         out.problems.push(Problem::new(of_demo.then_some(&id), None, of_demo, error.clone()));
     }
@@ -155,7 +232,7 @@ fn draft_file(
     }
     out.notes.extend(no_demos(file, &ids).map(|note| match base {
         None => note,
-        Some(_) => format!("{}: {note}", file.path.file_name().unwrap_or_default().to_string_lossy()),
+        Some(_) => format!("{}: {note}", file_name(file)),
     }));
     environment(file, &data_attrs, &mut out);
     let language = file_language(&out);
@@ -170,7 +247,7 @@ fn draft_file(
         ));
     }
     total(file, &data_attrs, &mut out);
-    masks(file, &ids, &mut out)?;
+    masks(file, &ids, base.is_some(), &mut out)?;
     Ok(out)
 }
 
@@ -199,7 +276,7 @@ fn environment(file: &Walked, attrs: &Attrs, out: &mut Draft) {
     let parsed = value
         .to_text()
         .ok_or_else(|| "no text".to_owned())
-        .and_then(|t| serde_json::from_str::<serde_json::Value>(&t).map_err(|e| e.to_string()));
+        .and_then(|t| serde_json::from_str::<Value>(&t).map_err(|e| e.to_string()));
     match parsed {
         Ok(json) => {
             let text = |key: &str| json.get(key).and_then(|v| v.as_str()).map(str::to_owned);
@@ -228,14 +305,14 @@ fn environment(file: &Walked, attrs: &Attrs, out: &mut Draft) {
 
 /// Whether the file says that its `env_args` are made up.
 fn stated_elsewhere(out: &Draft) -> bool {
-    let stated = out.texts.get("data/lerobot").and_then(|text| serde_json::from_str::<serde_json::Value>(text).ok());
-    stated.is_some_and(|stated| stated["environment"] == serde_json::Value::Bool(false))
+    let stated = out.texts.get("data/lerobot").and_then(|text| serde_json::from_str::<Value>(text).ok());
+    stated.is_some_and(|stated| stated["environment"] == Value::Bool(false))
 }
 
 /// An instruction that holds for the whole file.
 fn file_language(out: &Draft) -> Option<String> {
     let env = out.env_args.as_ref()?;
-    let text = |v: Option<&serde_json::Value>| v.and_then(|v| v.as_str()).map(str::to_owned);
+    let text = |v: Option<&Value>| v.and_then(|v| v.as_str()).map(str::to_owned);
     text(env.get("lang"))
         .or_else(|| text(env.get("env_kwargs").and_then(|k| k.get("env_lang"))))
         .filter(|t| !t.is_empty())
@@ -255,7 +332,7 @@ fn demo(
     let task = attrs
         .get("ep_meta")
         .and_then(Array::to_text)
-        .and_then(|t| serde_json::from_str::<serde_json::Value>(&t).ok())
+        .and_then(|t| serde_json::from_str::<Value>(&t).ok())
         .and_then(|meta| meta.get("lang")?.as_str().map(str::to_owned))
         .filter(|t| !t.is_empty())
         .or_else(|| language.map(str::to_owned));
@@ -350,12 +427,16 @@ fn check(file: &Walked, plan: &DemoPlan, of: &str, out: &mut Draft) {
         }
     }
     let wrong = wrong_lengths(file, id, (plan.length, of), &plan.keys);
+    // nothing of the demo has the length that is stated, which may be any number
+    if let (false, Some(first)) = (of.is_empty(), wrong.first()) {
+        return out.problems.push(Problem { key: None, ..first.clone() });
+    }
     out.problems.extend(wrong.into_iter().filter(|p| !known.iter().any(|known| p.key.as_ref() == Some(known))));
 }
 
 fn total(file: &Walked, attrs: &Attrs, out: &mut Draft) {
     let Some(stated) = attrs.get("total") else { return };
-    let steps: usize = out.demos.iter().map(|d| d.plan.length).sum();
+    let steps = out.demos.iter().fold(0_usize, |steps, demo| steps.saturating_add(demo.plan.length));
     if stated.to_i64().and_then(|n| usize::try_from(n).ok()) != Some(steps) {
         let error = InputError::BadAttribute {
             path: file.path.clone(),
@@ -368,7 +449,7 @@ fn total(file: &Walked, attrs: &Attrs, out: &mut Draft) {
     }
 }
 
-fn masks(file: &Walked, demos: &[(u64, String, String)], out: &mut Draft) -> Result<(), InputError> {
+fn masks(file: &Walked, demos: &[(u64, String, String)], renumbered: bool, out: &mut Draft) -> Result<(), InputError> {
     let known: BTreeMap<&str, &str> = demos.iter().map(|(_, id, name)| (name.as_str(), id.as_str())).collect();
     let paths: Vec<&str> =
         file.datasets.starting_at("mask/").map(|(path, _)| path).take_while(|path| path.starts_with("mask/")).collect();
@@ -386,15 +467,22 @@ fn masks(file: &Walked, demos: &[(u64, String, String)], out: &mut Draft) -> Res
             out.problems.push(Problem::new(None, None, false, error));
             continue;
         };
-        // robomimic's own `dataset_states_to_obs --n 3` copies the masks of the whole file
-        let absent: Vec<String> =
-            ids.iter().filter(|id| !known.contains_key(id.as_str())).map(|id| one_line(id)).collect();
+        // robomimic's own `dataset_states_to_obs --n 3` copies the masks of the whole file; what is absent is no demo that
+        // another file has under this name
+        let mut absent = Vec::new();
+        let here = ids.iter().map(|id| match known.get(id.as_str()) {
+            Some(&id) => id.to_owned(),
+            None => {
+                let id = if renumbered { format!("{} {id}", file_name(file)) } else { id.clone() };
+                absent.push(one_line(&id));
+                id
+            }
+        });
+        let here: Vec<String> = here.collect();
         if !absent.is_empty() {
             out.notes.push(mask_note(&name, ids.len(), &absent));
         }
-        let ids = ids.into_iter().map(|id| known.get(id.as_str()).map_or(id.clone(), |&id| id.to_owned()));
-        out.masks.insert(name, ids.collect());
+        out.masks.insert(name, here);
     }
-    out.notes.extend(shared_notes(&out.masks));
     Ok(())
 }

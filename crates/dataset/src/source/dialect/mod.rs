@@ -17,6 +17,7 @@ mod robotwin;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
+use super::local::file_number;
 use super::value::one_line;
 use super::walk::Walked;
 use crate::error::InputError;
@@ -151,6 +152,7 @@ pub(super) fn draft(survey: &Survey, beat: &mut dyn FnMut()) -> Result<Draft, In
     let faults = survey.files.iter().flat_map(|file| &file.faults);
     draft.problems.splice(0..0, faults.map(|fault| Problem::new(None, None, false, fault.clone())));
     draft.notes.extend(odd_attrs(survey));
+    draft.notes.extend(renumbered(survey, &draft.demos));
     ragged(survey, &mut draft);
     Ok(draft)
 }
@@ -356,25 +358,40 @@ fn observed(keys: &mut BTreeMap<String, KeyPlan>, length: usize) {
     }
 }
 
-/// The id of the episode that a file is: the number of its name, unless another has it.
+/// The id of the episode that a file is: the number of its name, or the next free one where another has it.
 fn id_of(file: &Path, index: usize, demos: &[DemoDraft]) -> (u64, String) {
-    let number = number_of(file, index);
-    let id = format!("demo_{number}");
-    match demos.iter().any(|demo| demo.plan.id == id) {
-        true => (number, format!("demo_{number}_{index}")),
-        false => (number, id),
+    let numbers = || demos.iter().map(|demo| demo.plan.number);
+    let mut number = number_of(file, index);
+    if numbers().any(|taken| taken == number) {
+        number = numbers().max().map_or(0, |last| last.saturating_add(1));
     }
+    (number, format!("demo_{number}"))
+}
+
+/// A note on the files whose episodes have other numbers than their names.
+fn renumbered(survey: &Survey, demos: &[DemoDraft]) -> Option<String> {
+    let other = |demo: &DemoDraft| {
+        let (index, _) = demo.home.as_ref().filter(|(_, home)| home.is_empty())?;
+        let path = &survey.files[*index].path;
+        let name = path.strip_prefix(&survey.path).unwrap_or(path).display();
+        (number_of(path, *index) != demo.plan.number).then(|| format!("{name} is {}", demo.plan.id))
+    };
+    let others: Vec<String> = demos.iter().filter_map(other).collect();
+    let all = list(others.iter().map(String::as_str));
+    (!others.is_empty()).then(|| format!("files of other folders or names have the same numbers, so {all}"))
 }
 
 /// A file that is no episode as the others of its folder are.
-fn stranger(file: &Walked, index: usize, expected: &str) -> Problem {
+fn stranger(file: &Walked, expected: &str) -> Problem {
     let unknown = || InputError::UnknownLayout {
         path: file.path.clone(),
         expected: expected.to_owned(),
         found: list(file.datasets.keys()),
     };
     let error = file.broken.values().next().cloned().unwrap_or_else(unknown);
-    Problem::new(Some(&format!("demo_{}", number_of(&file.path, index))), None, true, error)
+    // an episode may have its number
+    let id = file.path.file_name().unwrap_or_default().to_string_lossy();
+    Problem::new(Some(&id), None, true, error)
 }
 
 /// Text of a small file beside the source; `None` where there is none.
@@ -397,9 +414,10 @@ fn number_after(name: &str, prefix: &str) -> Option<u64> {
 
 /// The number at the end of a file's name; its position in the folder if there is none.
 pub(super) fn number_of(file: &Path, index: usize) -> u64 {
-    let stem = file.file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();
-    let digits = stem.len() - stem.bytes().rev().take_while(u8::is_ascii_digit).count();
-    stem[digits..].parse().unwrap_or(index as u64)
+    match file_number(file) {
+        u64::MAX => index as u64,
+        number => number,
+    }
 }
 
 /// Names in a line; at most twenty of them.

@@ -37,7 +37,7 @@ impl Layout for Robotwin {
             if is_episode(file) {
                 episode(index, file, &mut out)?;
             } else {
-                out.problems.push(stranger(file, index, "joint_action and observation as in the other files"));
+                out.problems.push(stranger(file, "joint_action and observation as in the other files"));
             }
             beat();
         }

@@ -102,3 +102,16 @@ fn odd_instructions_and_numbers_are_said() {
     let text = source.read_demo(0).unwrap_err().to_string();
     assert!(text.ends_with("steps/count of demo_0: the number 300 where uint8 is stated"), "{text}");
 }
+
+#[test]
+fn features_of_one_name_here_are_not_confused() {
+    let dir = tempfile::tempdir().unwrap();
+    let steps = json!({"action": tensor("float32"), "actions": tensor("float32")});
+    let features = dict(json!({"steps": {"sequence": {"feature": dict(steps)}}}));
+    let (first, second) = (field(1, &[0; 8]), field(1, &[1; 8]));
+    let set = dir.path().join("1.0.0");
+    written(&set, &features, &[record(&[("steps/action", 2, first), ("steps/actions", 2, second)])]);
+    let source = Source::open(&set).unwrap();
+    assert_eq!(source.plan().notes, ["steps/actions is left out: steps/action becomes actions too"]);
+    assert_eq!(source.read_rows(0, "actions", 0, 2).unwrap().bytes, [0; 8]);
+}

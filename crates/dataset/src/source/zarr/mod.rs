@@ -17,6 +17,7 @@ use half::f16;
 use serde::Deserialize;
 use serde_json::Value;
 
+use super::MAX_STEPS;
 use super::local::Backend;
 use crate::error::InputError;
 use crate::plan::{DemoPlan, Dialect, KeyPlan, Place, Plan, Problem};
@@ -454,14 +455,15 @@ impl Buffer {
                 problems.push(Problem::empty(&self.path, &id, "meta/episode_ends"));
                 continue;
             }
-            if let Some((_, key, found)) = short.as_ref().filter(|(rows, ..)| end > *rows) {
-                let error = InputError::WrongLength {
-                    path: self.path.clone(),
-                    demo: id.clone(),
-                    key: key.clone(),
-                    expected: format!("{steps} (meta/episode_ends)"),
-                    found: found.clone(),
-                };
+            let wrong = match short.as_ref().filter(|(rows, ..)| end > *rows) {
+                Some((_, key, found)) => Some((key.clone(), format!("{steps} (meta/episode_ends)"), found.clone())),
+                // chunks that are not stored state any number of steps
+                None => (end - first > MAX_STEPS).then(|| {
+                    ("meta/episode_ends".to_owned(), format!("at most {MAX_STEPS}"), (end - first).to_string())
+                }),
+            };
+            if let Some((key, expected, found)) = wrong {
+                let error = InputError::WrongLength { path: self.path.clone(), demo: id.clone(), key, expected, found };
                 problems.push(Problem::new(Some(&id), None, true, error));
                 first = end;
                 continue;

@@ -117,10 +117,11 @@ impl Store {
     pub fn files(&self, path: &Path) -> Vec<(PathBuf, u64)> {
         fn walk(folder: &Path, depth: usize, found: &mut Vec<(PathBuf, u64)>) {
             for entry in std::fs::read_dir(folder).into_iter().flatten().flatten() {
-                match entry.file_type() {
-                    Ok(kind) if kind.is_dir() && depth > 0 => walk(&entry.path(), depth - 1, found),
-                    Ok(kind) if kind.is_dir() => {}
-                    _ => found.push((entry.path(), entry.metadata().map_or(0, |m| m.len()))),
+                // an array may be a link
+                match std::fs::metadata(entry.path()) {
+                    Ok(meta) if meta.is_dir() && depth > 0 => walk(&entry.path(), depth - 1, found),
+                    Ok(meta) if meta.is_dir() => {}
+                    meta => found.push((entry.path(), meta.map_or(0, |m| m.len()))),
                 }
             }
         }

@@ -148,3 +148,25 @@ fn zarr_3_is_told_what_is_read() {
     std::fs::write(dir.path().join("zarr.json"), "{}").unwrap();
     assert!(refused(dir.path()).contains("zarr 2 is read: copy its arrays"), "{}", refused(dir.path()));
 }
+
+#[test]
+fn steps_that_are_stated_alone_are_refused() {
+    let (_dir, store) = store();
+    let steps = 1_000_000_000_000_usize;
+    array(&store, "meta/episode_ends", "<i8", &[1], json!(0), &[&steps.to_le_bytes()[..], &[0; 8]].concat());
+    for path in ["data/action", "data/state"] {
+        array(&store, path, "<f4", &[steps, 1], json!(0.0), &[0; 8]);
+    }
+    let text = refused(&store);
+    assert!(text.ends_with("meta/episode_ends: expected at most 16777216 steps, found 1000000000000"), "{text}");
+}
+
+#[test]
+fn the_files_of_a_linked_array_are_the_stores() {
+    let (dir, store) = store();
+    std::fs::rename(store.join("data/state"), dir.path().join("state")).unwrap();
+    std::os::unix::fs::symlink(dir.path().join("state"), store.join("data/state")).unwrap();
+    let files = Source::open(&store).unwrap().plan().files.clone();
+    assert!(files.contains(&(store.join("data/state/0.0"), 8)), "{files:?}");
+    assert!(files.iter().all(|(path, _)| path.is_file()), "{files:?}");
+}

@@ -28,6 +28,7 @@ fn every_frame_is_kept_and_videos_are_joined_without_encoding() {
     let out = dir.path().join("set");
     let report = convert(&old, &out, &ConvertOptions::default(), &mut quiet).unwrap();
     assert_eq!((report.dialect, report.episodes, report.frames), ("LeRobot v2.1", 3, 15));
+    assert_eq!(report.notes, ["not copied: README.md"]);
     let set = Dataset::open(&out).unwrap();
     assert_eq!(set.tasks(), ["pick the cube", "place the cube"]);
     assert_eq!(set.episodes().iter().map(|e| e.length).collect::<Vec<_>>(), [5, 4, 6]);
@@ -107,6 +108,25 @@ fn what_is_missing_is_named_as_the_folder_has_it() {
         std::fs::write(old.join("meta/info.json"), info.replace("data/chunk-{", "../chunk-{")).unwrap();
     });
     assert!(text.contains("data_path"), "{text}");
+    let edited = |old: &Path, from: &str, to: &str| {
+        let info = std::fs::read_to_string(old.join("meta/info.json")).unwrap();
+        std::fs::write(old.join("meta/info.json"), info.replace(from, to)).unwrap();
+    };
+    let planted = dir.path().join("planted");
+    for name in [planted.to_str().unwrap(), "../../planted"] {
+        let text = broken(&format!("escape_{}", name.len()), &|old| {
+            edited(old, TOP, name);
+            edited(old, "{video_key}", TOP);
+        });
+        assert!(text.contains("meta/info.json: features: expected names that stay inside the folder"), "{text}");
+        assert!(!planted.exists());
+    }
+    let text = broken("one_video", &|old| edited(old, "{video_key}", TOP));
+    assert!(text.contains("meta/info.json: video_path: expected") && text.contains("with video_key"), "{text}");
+    let whole = dir.path().join("whole");
+    copy(&fixture("lerobot_v21"), &whole);
+    let refused = convert(&whole, &whole.join("inside"), &ConvertOptions::default(), &mut quiet).unwrap_err();
+    assert!(refused.to_string().contains("inside: output: expected a place outside of "), "{refused}");
 }
 
 #[test]
@@ -205,7 +225,7 @@ fn a_column_that_is_not_stated_is_left_out_and_times_are_finite() {
     assert!(text.contains("timestamp: episode 1, frame 0: NaN") && text.contains("--nonfinite keep"), "{text}");
     let keep = ConvertOptions { nonfinite: NonFinite::Keep, ..ConvertOptions::default() };
     let notes = convert(&old, &out, &keep, &mut quiet).unwrap().notes;
-    let [column, times] = notes.as_slice() else { panic!("{notes:?}") };
+    let [column, times, _] = notes.as_slice() else { panic!("{notes:?}") };
     assert!(
         column.starts_with("column next.done: ") && column.ends_with("it is left out, with its values"),
         "{column}"
