@@ -93,7 +93,7 @@ def on_slurm(program: Path, shards: int, source: str, out: str | Path, folder: P
     sbatch.write_text(SBATCH)
     sbatch.chmod(0o755)
     path = f"{sbatch.parent}:{os.environ['PATH']}"
-    given = os.environ | {"PATH": path, "ACTRM_DATA": str(program), "ACTRM_PYTHON": sys.executable}
+    given = os.environ | {"PATH": path, "ACTRM_DATA": str(program), "ACTRM_CLUSTER_PYTHON": sys.executable}
     driver = [ROOT / "tools" / "cluster" / "slurm_convert.sh", str(shards), source, out]
     done = subprocess.run([*map(str, driver)], capture_output=True, text=True, check=False, env=given)
     if done.returncode:

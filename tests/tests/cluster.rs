@@ -105,7 +105,7 @@ fn a_conversion_as_an_array_of_shards() {
         let mut command = Command::new(&script);
         command.args(["3", text(&source), "set", "--file-size", "0.05"]).current_dir(folder.path());
         command.env("PATH", &path).env("ACTRM_DATA", program("actrm-data").get_program()).env("JOBS", &jobs);
-        command.env("ACTRM_PYTHON", root().join(".venv/bin/python"));
+        command.env("ACTRM_CLUSTER_PYTHON", root().join(".venv/bin/python"));
         command
     };
     succeeds(&mut run());
