@@ -123,7 +123,10 @@ impl Mapping {
                 return Err(failed(format!("key: expected each once, found {} again", item.key)));
             }
             if ["prompt", RESET, SEED, EXECUTED].contains(&item.key.as_str()) {
-                return Err(failed(format!("key: expected none that a message has anyway, found {}", item.key)));
+                return Err(failed(format!(
+                    "key: expected another than prompt, reset, seed and executed, which every message may have, found {}",
+                    item.key
+                )));
             }
         }
         Ok(mapping)
@@ -357,6 +360,7 @@ mod tests {
             ("timeout_s = 0", "timeout_s: expected 1 to 86400, found 0"),
             ("[[observation]]\nkey = 'a'\nfeature = 'b'\nsize = 5000", "size: expected 1 to 4096, found 5000"),
             ("[[observation]]\nkey = 'a'\nfeature = 'b'\n[[observation]]\nkey = 'a'\nfeature = 'c'", "found a again"),
+            ("[[observation]]\nkey = 'seed'\nfeature = 'b'", "key: expected another than prompt, reset, seed"),
             ("[[observation]]\nkey = 'a'\nfeature = 'b'\nflip = 'sideways'", "horizontal"),
         ] {
             let error = Mapping::parse("m.toml", text).unwrap_err().to_string();

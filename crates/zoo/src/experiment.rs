@@ -431,6 +431,11 @@ mod tests {
         assert!(error(&["entry=Lift"]).starts_with("entry name `Lift`"));
         assert!(error(&["data.state_keys=[]"]).starts_with("key `data.state_keys`"));
         assert_eq!(error(&["data.n_obs_steps=0"]), "key `data.n_obs_steps`: expected 1 to 1000, found 0");
+        // known before the data is opened
+        let images = "data.cameras=['agentview']";
+        assert_eq!(error(&["data.n_obs_steps=2", images]), "cannot build the policy of `lift-act`");
+        let often = error(&["data.beginning={steps=8,times=1000000000000}"]);
+        assert!(often.starts_with("key `data.beginning`: expected 1 to 1000"), "{often}");
     }
 
     #[test]

@@ -9,6 +9,7 @@ mod columns;
 mod depth;
 mod edit;
 mod edited;
+mod joined;
 mod layouts;
 mod lerobot;
 mod planted;

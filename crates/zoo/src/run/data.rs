@@ -236,7 +236,7 @@ pub(super) fn prepare(
     if let Some(both) = valid.iter().find(|episode| train.contains(episode)) {
         return Err(unfit(format!(
             "masks `{mask}` and `{}` share episode {both}: a validation on training data says nothing; \
-             data.valid_mask=\"\" trains without one",
+             set data.valid_mask=\"\" to train without validation",
             held_out
         )));
     }

@@ -31,7 +31,9 @@ pub struct Extended {
 pub fn extend(run: &Path, runs: &Path, steps: u64) -> Result<Extended, ZooError> {
     let nothing = |reason: &str| ZooError::NothingToResume { folder: run.to_owned(), reason: reason.to_owned() };
     if !run.is_dir() {
-        return Err(nothing("there is no such folder; `train` prints that of a run, such as runs/act_lift/001"));
+        return Err(nothing(
+            "there is no such folder; `train` prints the folder of its run, such as runs/act_lift/001",
+        ));
     }
     let Some(entry) = finished_entry(run)? else {
         return Err(nothing("it is not finished; --resume continues it"));
